@@ -1,0 +1,1 @@
+"""Calibrate a rig: align the two cameras, and say how well they are aligned."""

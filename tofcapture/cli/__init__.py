@@ -1,0 +1,107 @@
+"""The one program, ``tofcapture``.
+
+Commands are found in the entry-point group ``tofcapture.commands``; a sibling package adds its own and is imported only when
+asked for. Results go to stdout, progress and errors to stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
+
+from tofcapture import __version__
+from tofcapture.command import Command, Outcome
+from tofcapture.errors import ConfigError, TofError, UsageError
+
+GROUP = "tofcapture.commands"
+EXIT_CODES = "exit codes: 0 ok, 1 unexpected, 2 usage, 3 config, 4 device, 5 data, 6 quality gate, 7 busy, 130 interrupted"
+ORDER = ("demo", "doctor", "record", "simulate", "align", "build-dataset", "check", "train", "evaluate", "predict", "report")
+
+
+class _Parser(argparse.ArgumentParser):
+    """An ArgumentParser that raises, so that ``--json`` covers usage errors too."""
+
+    def error(self, message: str) -> None:  # type: ignore[override]
+        raise UsageError(message, hint=f"{self.prog} --help")
+
+
+def _found() -> dict[str, EntryPoint]:
+    found = {e.name: e for e in entry_points(group=GROUP)}
+    if not found:
+        raise ConfigError("no commands are registered", hint="install the package: pip install '.[all]'")
+    return {name: found[name] for name in sorted(found, key=lambda n: (ORDER.index(n) if n in ORDER else 99, n))}
+
+
+def _load(entry: EntryPoint) -> Command:
+    command = entry.load()
+    if not isinstance(command, Command):
+        raise ConfigError(f"{entry.value}: expected a tofcapture.command.Command, got {type(command).__name__}")
+    return command
+
+
+def parser(commands: dict[str, Command]) -> argparse.ArgumentParser:
+    """Build the parser of the given commands."""
+    top = _Parser(prog="tofcapture", description=__doc__.splitlines()[0] if __doc__ else "", epilog=EXIT_CODES)
+    top.add_argument("--version", action="version", version=f"tofcapture {__version__}")
+    subs = top.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+    for name, command in commands.items():
+        sub = subs.add_parser(
+            name,
+            help=command.help,
+            description=command.help,
+            epilog=f"example:\n  {command.example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        command.configure(sub)
+        sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    return top
+
+
+def _run(argv: Sequence[str]) -> Outcome:
+    entries = _found()
+    named = next((a for a in argv if not a.startswith("-")), None)
+    wanted = {named: entries[named]} if named in entries else entries
+    top = parser({name: _load(entry) for name, entry in wanted.items()})
+    args = top.parse_args(argv)
+    if args.command is None:
+        return Outcome(text=top.format_help().rstrip())
+    return _load(entries[args.command]).run(args)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code; every expected error becomes at most a few lines on stderr."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    as_json = "--json" in argv
+    try:
+        outcome = _run(argv)
+    except TofError as err:
+        return _failed(err.message, err.hint, err.exit_code, type(err).__name__, as_json=as_json)
+    except KeyboardInterrupt:
+        return _failed("interrupted", "run the same command again to go on", 130, "Interrupted", as_json=as_json)
+    except ModuleNotFoundError as err:
+        if os.environ.get("TOFCAPTURE_TRACEBACK"):
+            raise
+        return _failed(f"the library {err.name} is missing", "pip install 'tofcapture[all]'", 3, "Missing", as_json=as_json)
+    except OSError as err:
+        if os.environ.get("TOFCAPTURE_TRACEBACK"):
+            raise
+        return _failed(str(err), "set TOFCAPTURE_TRACEBACK=1 to see where", 1, type(err).__name__, as_json=as_json)
+    if as_json:
+        print(json.dumps(outcome.data, allow_nan=False, default=str))
+    elif outcome.text:
+        print(outcome.text)
+    return outcome.exit_code
+
+
+def _failed(message: str, hint: str, code: int, kind: str, *, as_json: bool) -> int:
+    if as_json:
+        print(json.dumps({"ok": False, "error": {"kind": kind, "message": message, "hint": hint, "exit_code": code}}))
+    else:
+        print(f"tofcapture: {message}", file=sys.stderr)
+        if hint:
+            print(f"  try: {hint}", file=sys.stderr)
+    return code

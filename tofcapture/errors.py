@@ -1,0 +1,82 @@
+"""Every error that tofcapture raises on purpose.
+
+::
+
+    TofError                 exit code 1   anything below
+    ├── UsageError           2             the command line does not make sense
+    ├── ConfigError          3             a TOML file, an option or a value is wrong
+    ├── DeviceError          4             a device is missing, silent or refuses
+    │   └── MotionRefused    4             the arm must not or cannot go there
+    ├── DataError            5             a file is damaged, foreign, or says something impossible
+    │   └── FormatError      5             a file's layout is not the one its version promises
+    ├── QualityError         6             a gate refused a result (registration, coverage, ground truth)
+    └── BusyError            7             someone else holds the recording or the station
+
+Exit code 0 is success, 130 an interruption by the user. A message says what was expected, what was found, and
+where; ``hint`` says what to try next.
+"""
+
+from __future__ import annotations
+
+
+class TofError(Exception):
+    """Base of the tree.
+
+    Parameters
+    ----------
+    message
+        Expected, got, where; one sentence.
+    hint
+        What to try next; one sentence, may be empty.
+    """
+
+    exit_code = 1
+
+    def __init__(self, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+
+class UsageError(TofError):
+    """The command line does not make sense."""
+
+    exit_code = 2
+
+
+class ConfigError(TofError):
+    """A TOML file, an option or a value is wrong."""
+
+    exit_code = 3
+
+
+class DeviceError(TofError):
+    """A device is missing, silent or refuses."""
+
+    exit_code = 4
+
+
+class MotionRefused(DeviceError):  # noqa: N818  the arm's answer is a refusal, not a fault
+    """The arm must not, or cannot, go there."""
+
+
+class DataError(TofError):
+    """A file is damaged, foreign, or says something impossible."""
+
+    exit_code = 5
+
+
+class FormatError(DataError):
+    """A file's layout is not the one its version promises."""
+
+
+class QualityError(TofError):
+    """A gate refused a result."""
+
+    exit_code = 6
+
+
+class BusyError(TofError):
+    """Someone else holds the recording or the station."""
+
+    exit_code = 7

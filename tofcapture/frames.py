@@ -1,0 +1,196 @@
+"""What devices hand over, and a view: everything captured at one pose of one scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.camera import Camera
+from tofcapture.errors import DataError
+from tofcapture.poses import Float64, check_transform
+from tofcapture.rig import RangeError, Rig
+
+PAPER_MODULATION_HZ = (20e6,) * 4 + (100e6,) * 4
+PAPER_PHASE_RAD = tuple(float(k) * np.pi / 2 for k in range(4)) * 2
+
+
+@dataclass(frozen=True)
+class TofInfo:
+    """What a ToF driver says of its camera without opening it.
+
+    Attributes
+    ----------
+    model, serial
+        Free text.
+    camera
+        Intrinsics.
+    illuminator
+        (3,) light source in the ToF frame, metres.
+    modulation_hz, phase_rad
+        (8,) frequency and demodulation phase of each raw channel: ``C_k = B + A cos(phi + phase_rad[k])``.
+    exposure
+        Integration time of one phase image, seconds.
+    saturation
+        Raw value from which a tap is saturated.
+    range_errors
+        The camera's factory calibration, one per frequency; empty when it has none.
+    """
+
+    model: str
+    serial: str
+    camera: Camera
+    illuminator: Float64
+    modulation_hz: tuple[float, ...] = PAPER_MODULATION_HZ
+    phase_rad: tuple[float, ...] = PAPER_PHASE_RAD
+    exposure: float = 400e-6
+    saturation: float = 4095.0
+    range_errors: tuple[RangeError, ...] = ()
+
+
+@dataclass(frozen=True)
+class TofBurst:
+    """Raw phase images of one static burst.
+
+    Attributes
+    ----------
+    raw
+        (frames, 8, H, W): uint16 as the sensor gave it (float64 only from an ideal simulation).
+    time_ns
+        (frames,) int64, monotonic clock.
+    celsius
+        (frames,) float64 sensor temperature, NaN when the sensor does not say.
+    info
+        The camera that took it.
+    """
+
+    raw: NDArray[Any]
+    time_ns: NDArray[np.int64]
+    celsius: Float64
+    info: TofInfo
+
+    def __post_init__(self) -> None:
+        shape = (len(self.time_ns), len(self.info.modulation_hz), *self.info.camera.shape)
+        if self.raw.shape != shape:
+            raise DataError(f"ToF burst: expected raw of shape {shape}, got {self.raw.shape}")
+
+
+@dataclass(frozen=True)
+class StereoInfo:
+    """What a stereo driver says of its camera: model, serial, intrinsics of the point map's grid."""
+
+    model: str
+    serial: str
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class StereoFrame:
+    """One organised point map.
+
+    Attributes
+    ----------
+    points
+        (H, W, 3) float32, stereo frame, metres; NaN where nothing was measured.
+    time_ns
+        int, monotonic clock.
+    info
+        The camera that took it.
+    """
+
+    points: NDArray[np.float32]
+    time_ns: int
+    info: StereoInfo
+
+    def __post_init__(self) -> None:
+        expected = (*self.info.camera.shape, 3)
+        if self.points.shape != expected:
+            raise DataError(f"stereo frame: expected points of shape {expected}, got {self.points.shape}")
+
+
+@dataclass(frozen=True)
+class ArmInfo:
+    """What an arm driver says of its arm: model (``ur10e`` ...) and serial."""
+
+    model: str
+    serial: str
+
+
+@dataclass(frozen=True)
+class ArmState:
+    """Where the arm says it is.
+
+    Attributes
+    ----------
+    joints
+        (6,) measured joint angles, radians.
+    T_base_flange
+        (4, 4), from the measured joints.
+    time_ns
+        int, monotonic clock.
+    """
+
+    joints: Float64
+    T_base_flange: Float64
+    time_ns: int
+
+    def __post_init__(self) -> None:
+        check_transform(self.T_base_flange, "arm state: T_base_flange")
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What only a simulator knows of a view.
+
+    Attributes
+    ----------
+    depth
+        (2H, 2W) float32, exact depth at the pixel centres of the ToF plane at twice its resolution, metres; NaN for
+        rays that hit nothing.
+    normals
+        (2H, 2W, 3) float32, geometric normals in the ToF frame, unit, facing the camera.
+    target
+        (2H, 2W) bool, the ray hits the scene's object (not table or background).
+    T_tof_stereo, T_flange_tof
+        (4, 4) of the true rig.
+    """
+
+    depth: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    target: NDArray[np.bool_]
+    T_tof_stereo: Float64
+    T_flange_tof: Float64
+
+
+@dataclass(frozen=True)
+class View:
+    """Everything captured at one pose of one scene.
+
+    Attributes
+    ----------
+    scene, index
+        Name of the scene (``calibration`` for board views), number of the view from 0.
+    tof, stereo
+        What the cameras handed over.
+    arm_before, arm_after
+        Arm state before the first and after the last exposure.
+    rig
+        The rig as it was known when the view was taken.
+    provenance
+        Strings and numbers: versions, seed, plan digest, UTC time ...
+    truth
+        Only from a simulator.
+    """
+
+    scene: str
+    index: int
+    tof: TofBurst
+    stereo: StereoFrame
+    arm_before: ArmState
+    arm_after: ArmState
+    rig: Rig
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    truth: Truth | None = None
