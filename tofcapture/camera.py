@@ -96,8 +96,7 @@ class Camera:
         depth
             (...,), metres.
         """
-        points = np.asarray(points, dtype=np.float64)
-        z = points[..., 2]
+        z: Float64 = np.asarray(points, dtype=np.float64)[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             safe = np.where(z > 0, z, np.nan)
             u = self.fx * points[..., 0] / safe + self.cx

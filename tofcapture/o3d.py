@@ -6,6 +6,7 @@ open3d links ``libusb-1.0.so.0``, which a fresh Debian or Ubuntu lacks and which
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import importlib
 import sys
@@ -38,10 +39,9 @@ def load_open3d() -> ModuleType:
         When open3d is not installed or does not load.
     """
     if "open3d" not in sys.modules and sys.platform == "linux":
-        try:
+        # Where this fails, open3d's own error names the library that is missing.
+        with contextlib.suppress(ImportError, OSError):
             _preload_libusb()
-        except (ImportError, OSError):
-            pass  # open3d's own error, below, names the library that is missing
     try:
         return importlib.import_module("open3d")
     except (ImportError, OSError) as err:

@@ -172,9 +172,11 @@ def rig_from_dict(table: Mapping[str, Any], where: str = "rig") -> Rig:
     known = {"format", "version", "units", "tof", "stereo", "T_tof_stereo", "T_flange_tof", "range_error"}
     unknown = table.keys() - known
     if unknown:
-        raise ConfigError(f"{where}: unknown key {', '.join(sorted(unknown))}", hint="see docs/formats.md, rig.toml")
+        raise ConfigError(
+            f"{where}: unknown key {', '.join(sorted(unknown))}", hint="see docs/formats.md, rig.toml"
+        )
     if table.get("units") != "m":
-        raise ConfigError(f"{where}: expected units = \"m\", got {table.get('units')!r}")
+        raise ConfigError(f'{where}: expected units = "m", got {table.get("units")!r}')
     for key in ("tof", "stereo", "T_tof_stereo", "T_flange_tof"):
         if key not in table:
             raise ConfigError(f"{where}: missing {key}")
@@ -215,5 +217,7 @@ def load_rig(path: Path) -> Rig:
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as err:
-        raise ConfigError(f"{path}: cannot read the rig: {err}", hint="tofcapture align RECORDING writes one") from err
+        raise ConfigError(
+            f"{path}: cannot read the rig: {err}", hint="tofcapture align RECORDING writes one"
+        ) from err
     return loads_rig(text, str(path))

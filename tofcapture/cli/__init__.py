@@ -19,7 +19,19 @@ from tofcapture.errors import ConfigError, TofError, UsageError
 
 GROUP = "tofcapture.commands"
 EXIT_CODES = "exit codes: 0 ok, 1 unexpected, 2 usage, 3 config, 4 device, 5 data, 6 quality gate, 7 busy, 130 interrupted"
-ORDER = ("demo", "doctor", "record", "simulate", "align", "build-dataset", "check", "train", "evaluate", "predict", "report")
+ORDER = (
+    "demo",
+    "doctor",
+    "record",
+    "simulate",
+    "align",
+    "build-dataset",
+    "check",
+    "train",
+    "evaluate",
+    "predict",
+    "report",
+)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -33,19 +45,25 @@ def _found() -> dict[str, EntryPoint]:
     found = {e.name: e for e in entry_points(group=GROUP)}
     if not found:
         raise ConfigError("no commands are registered", hint="install the package: pip install '.[all]'")
-    return {name: found[name] for name in sorted(found, key=lambda n: (ORDER.index(n) if n in ORDER else 99, n))}
+    return {
+        name: found[name] for name in sorted(found, key=lambda n: (ORDER.index(n) if n in ORDER else 99, n))
+    }
 
 
 def _load(entry: EntryPoint) -> Command:
     command = entry.load()
     if not isinstance(command, Command):
-        raise ConfigError(f"{entry.value}: expected a tofcapture.command.Command, got {type(command).__name__}")
+        raise ConfigError(
+            f"{entry.value}: expected a tofcapture.command.Command, got {type(command).__name__}"
+        )
     return command
 
 
 def parser(commands: dict[str, Command]) -> argparse.ArgumentParser:
     """Build the parser of the given commands."""
-    top = _Parser(prog="tofcapture", description=__doc__.splitlines()[0] if __doc__ else "", epilog=EXIT_CODES)
+    top = _Parser(
+        prog="tofcapture", description=__doc__.splitlines()[0] if __doc__ else "", epilog=EXIT_CODES
+    )
     top.add_argument("--version", action="version", version=f"tofcapture {__version__}")
     subs = top.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     for name, command in commands.items():
@@ -81,15 +99,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     except TofError as err:
         return _failed(err.message, err.hint, err.exit_code, type(err).__name__, as_json=as_json)
     except KeyboardInterrupt:
-        return _failed("interrupted", "run the same command again to go on", 130, "Interrupted", as_json=as_json)
+        return _failed(
+            "interrupted", "run the same command again to go on", 130, "Interrupted", as_json=as_json
+        )
     except ModuleNotFoundError as err:
         if os.environ.get("TOFCAPTURE_TRACEBACK"):
             raise
-        return _failed(f"the library {err.name} is missing", "pip install 'tofcapture[all]'", 3, "Missing", as_json=as_json)
+        return _failed(
+            f"the library {err.name} is missing",
+            "pip install 'tofcapture[all]'",
+            3,
+            "Missing",
+            as_json=as_json,
+        )
     except OSError as err:
         if os.environ.get("TOFCAPTURE_TRACEBACK"):
             raise
-        return _failed(str(err), "set TOFCAPTURE_TRACEBACK=1 to see where", 1, type(err).__name__, as_json=as_json)
+        return _failed(
+            str(err), "set TOFCAPTURE_TRACEBACK=1 to see where", 1, type(err).__name__, as_json=as_json
+        )
     if as_json:
         print(json.dumps(outcome.data, allow_nan=False, default=str))
     elif outcome.text:
@@ -99,7 +127,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _failed(message: str, hint: str, code: int, kind: str, *, as_json: bool) -> int:
     if as_json:
-        print(json.dumps({"ok": False, "error": {"kind": kind, "message": message, "hint": hint, "exit_code": code}}))
+        print(
+            json.dumps(
+                {"ok": False, "error": {"kind": kind, "message": message, "hint": hint, "exit_code": code}}
+            )
+        )
     else:
         print(f"tofcapture: {message}", file=sys.stderr)
         if hint:

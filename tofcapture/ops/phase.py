@@ -87,7 +87,9 @@ def phasors(raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequen
         # Solve [B, A cos phi, -A sin phi] from the taps: exact for any >= 3 distinct phases.
         design = np.stack([np.ones(len(k)), np.cos(theta[k]), np.sin(theta[k])], axis=1)
         if len(k) < 3 or np.linalg.cond(design) > 1e3:
-            raise DataError(f"{hz / 1e6:g} MHz: the phases {np.degrees(theta[k]).tolist()} deg do not determine a phasor")
+            raise DataError(
+                f"{hz / 1e6:g} MHz: the phases {np.degrees(theta[k]).tolist()} deg do not determine a phasor"
+            )
         solve = np.linalg.pinv(design)
         taps = np.moveaxis(raw[..., k, :, :], -3, -1).astype(np.float64)
         out.append(taps @ (solve[1] - 1j * solve[2]))
@@ -155,7 +157,9 @@ def unwrap(range_low: Float64, range_high: Float64, ambiguity_high: float, ambig
     return range_high + k * ambiguity_high
 
 
-def range_to_radial(range_: NDArray[np.floating], camera: Camera, illuminator: NDArray[np.floating]) -> Float64:
+def range_to_radial(
+    range_: NDArray[np.floating], camera: Camera, illuminator: NDArray[np.floating]
+) -> Float64:
     """Distance along the ray from half the path illuminator - surface - camera.
 
     The surface point lies on the ellipsoid with foci camera and illuminator:
@@ -179,7 +183,9 @@ def range_to_radial(range_: NDArray[np.floating], camera: Camera, illuminator: N
     return out
 
 
-def radial_to_range(radial: NDArray[np.floating], camera: Camera, illuminator: NDArray[np.floating]) -> Float64:
+def radial_to_range(
+    radial: NDArray[np.floating], camera: Camera, illuminator: NDArray[np.floating]
+) -> Float64:
     """Half the path illuminator - surface - camera, of a distance along the ray; inverse of :func:`range_to_radial`."""
     u = camera.rays / camera.ray_lengths[..., None]
     points = np.asarray(radial, dtype=np.float64)[..., None] * u
@@ -196,9 +202,7 @@ def radius_px(camera: Camera) -> Float64:
     return out
 
 
-def correct_range(
-    range_: Float64, error: RangeError, camera: Camera, celsius: float
-) -> Float64:
+def correct_range(range_: Float64, error: RangeError, camera: Camera, celsius: float) -> Float64:
     """Take the systematic error of one frequency off its wrapped range and wrap again.
 
     The error is a function of the true phase; two fixed-point steps from the measured one leave a residual below 1 % of
@@ -252,7 +256,9 @@ def decode(
     """
     hz = frequencies(modulation_hz)
     if len(hz) != 2 or phasor.shape != (2, *camera.shape):
-        raise DataError(f"decode: expected phasors (2, {camera.height}, {camera.width}), got {phasor.shape} for {hz}")
+        raise DataError(
+            f"decode: expected phasors (2, {camera.height}, {camera.width}), got {phasor.shape} for {hz}"
+        )
     by_hz = {e.modulation_hz: e for e in range_errors}
     celsius = celsius if np.isfinite(celsius) else 45.0
     low, high = (

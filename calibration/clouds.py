@@ -1,0 +1,177 @@
+"""Points worth aligning: what a ToF burst and a stereo frame of one view say with certainty.
+
+Averaged ICP is limited by bias, not by noise: flying pixels shrink holes, saturated and dark pixels bend planes. So
+points are dropped freely here; tens of thousands remain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.errors import DataError
+from tofcapture.frames import StereoFrame, TofBurst
+from tofcapture.ops import phase
+from tofcapture.poses import Float64
+from tofcapture.rig import SPEED_OF_LIGHT
+
+Mask = NDArray[np.bool_]
+
+WORKING_DEPTH = (0.2, 1.8)  # m; where a 240x180 sensor of this kind measures validly (UD-ToF: 0.180 to 1.788 m)
+TOF_JUMP = 0.012  # m; departure from the local plane that marks a depth edge, over 4 sigma of a burst's noise
+TOF_MARGIN = 2  # px around a ToF depth edge that mixed pixels may reach
+STEREO_JUMP = 0.004  # m; the same on the reduced stereo grid, whose noise is ten times lower
+STEREO_BLOCK = 4  # px averaged to one stereo point: 2.8 mm at 0.8 m, finer than a ToF pixel
+MAX_SIGMA = 0.004  # m; predicted range noise of a burst-averaged pixel above which it is too dark to help
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points with normals.
+
+    Attributes
+    ----------
+    points
+        (N, 3) float64, metres, finite.
+    normals
+        (N, 3) float64, unit, facing the camera at the origin of the points' frame.
+    """
+
+    points: Float64
+    normals: Float64
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.shape != self.normals.shape:
+            raise DataError(f"cloud: expected points and normals (N, 3), got {self.points.shape}, {self.normals.shape}")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def dilate(mask: Mask, pixels: int) -> Mask:
+    """Grow a mask (H, W) by a square of ``2 pixels + 1``."""
+    out = np.pad(mask, pixels)
+    for axis in (0, 1):
+        windows = np.lib.stride_tricks.sliding_window_view(out, 2 * pixels + 1, axis=axis)
+        out = windows.any(axis=-1)
+    return out
+
+
+def plane_departure(depth: NDArray[np.floating]) -> Float64:
+    """How far each pixel lies off the line through its two neighbours, the larger of both image axes.
+
+    Inverse depth is linear in the pixel coordinates on any plane, however tilted, so that its second difference is zero there
+    and is one half jump at a depth edge.
+
+    Parameters
+    ----------
+    depth
+        (H, W), metres; NaN where nothing was measured.
+
+    Returns
+    -------
+    (H, W) float64, metres; infinite where the pixel or a neighbour has no measurement, and on the border.
+    """
+    inverse = 1 / np.asarray(depth, dtype=np.float64)
+    bend = np.full((2, *inverse.shape), np.inf)
+    bend[0, 1:-1] = inverse[:-2] - 2 * inverse[1:-1] + inverse[2:]
+    bend[1, :, 1:-1] = inverse[:, :-2] - 2 * inverse[:, 1:-1] + inverse[:, 2:]
+    out = np.abs(bend).max(axis=0) * np.square(depth) / 2
+    return np.where(np.isfinite(out), out, np.inf)
+
+
+def grid_normals(points: NDArray[np.floating]) -> Float64:
+    """Normals of an organised point map, from its tangents smoothed over 3 x 3.
+
+    Parameters
+    ----------
+    points
+        (H, W, 3), camera frame, metres; NaN where nothing was measured.
+
+    Returns
+    -------
+    (H, W, 3) float64, unit, facing the camera; NaN where a pixel of the 3 x 3 window is missing.
+    """
+    P = np.pad(np.asarray(points, dtype=np.float64), ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
+    rows = P[:-2] + P[1:-1] + P[2:]
+    columns = P[:, :-2] + P[:, 1:-1] + P[:, 2:]
+    normal = np.cross(columns[2:] - columns[:-2], rows[:, 2:] - rows[:, :-2])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    away = (normal * points).sum(axis=-1) > 0
+    return np.where(away[..., None], -normal, normal)
+
+
+def range_sigma(burst: TofBurst) -> Float64:
+    """Noise of the burst-averaged range of each pixel, predicted from the burst's own scatter.
+
+    ``sigma_r = c / (4 pi f) sigma_z / A`` at the highest frequency (method: ``sigma_phi = sigma_z / A``), where ``sigma_z`` is
+    one number, the median over the pixels, so that ten frames estimate it well.
+
+    Returns
+    -------
+    (H, W) float64, metres; zero for a burst of one frame, which cannot tell.
+    """
+    info, frames = burst.info, len(burst.raw)
+    z = phase.phasors(burst.raw, info.modulation_hz, info.phase_rad)[:, -1]
+    if frames < 2:
+        return np.zeros(info.camera.shape)
+    scatter = np.sqrt(np.median(z.var(axis=0, ddof=1) / 2) / frames)
+    amplitude = np.maximum(np.abs(z.mean(axis=0)), 1e-9)
+    out: Float64 = SPEED_OF_LIGHT / (4 * np.pi * max(info.modulation_hz)) * scatter / amplitude
+    return out
+
+
+def tof_points(burst: TofBurst) -> Float64:
+    """Trustworthy ToF points of a burst.
+
+    The burst is averaged as phasors and decoded with the camera's own range errors. Saturated pixels, dark pixels, pixels
+    within two of a depth edge and everything outside the working depth are dropped.
+
+    Returns
+    -------
+    (N, 3) float64, ToF frame, metres.
+    """
+    info = burst.info
+    saturated: Mask = (burst.raw >= info.saturation).any(axis=(0, 1))
+    phasor = phase.mean_phasors(burst.raw, info.modulation_hz, info.phase_rad)
+    celsius = float(np.mean(burst.celsius))
+    decoded = phase.decode(phasor, info.modulation_hz, info.camera, info.illuminator, info.range_errors, celsius, saturated)
+    depth = info.camera.radial_to_depth(decoded.radial)
+    edge = dilate(plane_departure(depth) > TOF_JUMP, TOF_MARGIN)
+    good = ~edge & (range_sigma(burst) < MAX_SIGMA) & _within(depth)
+    return info.camera.unproject(depth)[good]
+
+
+def stereo_cloud(frame: StereoFrame, block: int = STEREO_BLOCK) -> Cloud:
+    """Dense stereo points, averaged over blocks of the organised grid, with normals.
+
+    A block counts only when it is complete; blocks at depth edges, where stereo matchers draw veils, are dropped.
+
+    Parameters
+    ----------
+    frame
+        What the stereo camera gave.
+    block
+        Pixels averaged along each axis.
+
+    Returns
+    -------
+    Cloud
+        Stereo frame.
+    """
+    height, width = (n // block for n in frame.points.shape[:2])
+    tiles = frame.points[: height * block, : width * block].reshape(height, block, width, block, 3)
+    points = tiles.mean(axis=(1, 3), dtype=np.float64)
+    normals = grid_normals(points)
+    depth = points[..., 2]
+    edge = dilate(plane_departure(depth) > STEREO_JUMP, 1)
+    good = ~edge & np.isfinite(normals).all(axis=-1) & _within(depth)
+    return Cloud(points[good], normals[good])
+
+
+def _within(depth: NDArray[np.floating]) -> Mask:
+    near, far = WORKING_DEPTH
+    return (depth > near) & (depth < far)

@@ -1,0 +1,161 @@
+"""Ray casting of a scene: what a ray meets, and what sees what.
+
+Embree (through open3d) finds the hits; normals are geometric, so a scene means the same to every renderer that reads the
+same triangles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.devices.sim.scene import SceneObject
+from tofcapture.errors import ConfigError
+from tofcapture.o3d import load_open3d
+
+Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+
+# Rays leave a surface this far along its normal: far above float32 rounding of a few metres, far below a millimetre.
+_LIFT = 2e-5
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """All triangles of a scene, merged, world frame.
+
+    Attributes
+    ----------
+    corners
+        (M, 3, 3) float64, metres.
+    normals
+        (M, 3) float32 unit geometric normals by the winding.
+    albedo
+        (M,) float32.
+    owner
+        (M,) int64 index of the scene object.
+    target
+        (M,) bool, the triangle belongs to the scene's object.
+    """
+
+    corners: NDArray[np.float64]
+    normals: Float32
+    albedo: Float32
+    owner: Int64
+    target: NDArray[np.bool_]
+
+
+def merge(objects: Sequence[SceneObject]) -> Geometry:
+    """Merge the objects of a scene, dropping triangles without area.
+
+    Raises
+    ------
+    ConfigError
+        When nothing is left.
+    """
+    if not objects:
+        raise ConfigError("the scene is empty", hint="add at least one [[object]] to the world file")
+    corners = np.concatenate([o.corners() for o in objects])
+    counts = [len(o.triangles) for o in objects]
+    owner = np.repeat(np.arange(len(objects)), counts)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    keep = length > 1e-14
+    if not keep.any():
+        raise ConfigError("the scene has no triangle with an area", hint="is the mesh unit right?")
+    albedo = np.array([o.albedo for o in objects], dtype=np.float32)[owner]
+    target = np.array([o.target for o in objects])[owner]
+    return Geometry(
+        corners=corners[keep],
+        normals=(normals[keep] / length[keep, None]).astype(np.float32),
+        albedo=albedo[keep],
+        owner=owner[keep],
+        target=target[keep],
+    )
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where rays meet the scene, flat arrays of the same length.
+
+    Attributes
+    ----------
+    distance
+        float32, metres along the unit ray; infinite where nothing was met.
+    triangle
+        int64, -1 where nothing was met.
+    uv
+        (N, 2) float32 barycentric coordinates of corners 1 and 2.
+    """
+
+    distance: Float32
+    triangle: Int64
+    uv: Float32
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """The ray met something."""
+        out: NDArray[np.bool_] = self.triangle >= 0
+        return out
+
+
+class Caster:
+    """A scene ready for rays."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        self.geometry = geometry
+        o3d = load_open3d()
+        self._tensor: Any = o3d.core.Tensor
+        self._scene: Any = o3d.t.geometry.RaycastingScene()
+        vertices = geometry.corners.reshape(-1, 3).astype(np.float32)
+        triangles = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
+        self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
+
+    def cast(self, origins: NDArray[Any], directions: NDArray[Any]) -> Hits:
+        """First hits of rays.
+
+        Parameters
+        ----------
+        origins
+            (3,) or (N, 3), world frame, metres.
+        directions
+            (N, 3) unit vectors.
+        """
+        rays = np.empty((len(directions), 6), dtype=np.float32)
+        rays[:, :3] = origins
+        rays[:, 3:] = directions
+        answer = self._scene.cast_rays(self._tensor(rays))
+        triangle = answer["primitive_ids"].numpy().astype(np.int64)
+        distance = answer["t_hit"].numpy()
+        triangle[~np.isfinite(distance)] = -1
+        return Hits(distance=distance, triangle=triangle, uv=answer["primitive_uvs"].numpy())
+
+    def blocked(self, origins: Float32, target: NDArray[Any]) -> NDArray[np.bool_]:
+        """(N,) the segment from each origin (N, 3) to ``target`` ((3,) or (N, 3)) meets a surface.
+
+        Origins must already be lifted off their surface, see :func:`lift`.
+        """
+        rays = np.empty((len(origins), 6), dtype=np.float32)
+        rays[:, :3] = origins
+        rays[:, 3:] = np.asarray(target, dtype=np.float32) - origins
+        out: NDArray[np.bool_] = self._scene.test_occlusions(
+            self._tensor(rays), tnear=0.0, tfar=1.0 - 1e-5
+        ).numpy()
+        return out
+
+    def facing(self, triangle: Int64, directions: NDArray[Any]) -> Float32:
+        """(N, 3) normals of the triangles, turned against rays of the given directions."""
+        normals = self.geometry.normals[triangle]
+        away = np.einsum("ij,ij->i", normals, np.asarray(directions, dtype=np.float32)) > 0
+        normals[away] *= -1
+        return normals
+
+
+def lift(points: NDArray[Any], normals: Float32) -> Float32:
+    """Points (N, 3) moved a hair along their normals, so that new rays do not meet the surface they leave."""
+    out: Float32 = (points + _LIFT * normals).astype(np.float32)
+    return out

@@ -1,0 +1,186 @@
+"""What stands on the simulated table, by name.
+
+The world is the arm's base frame. The table top lies half a metre below the base, on a pedestal's foot as it were: a UR10e then
+reaches three quarters of the directions within 65 deg of vertical at 0.8 m and still half of them at 1.4 m, against a quarter
+and an eighth for a table at the height of the base.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tofcapture.devices.sim.meshes import read_mesh
+from tofcapture.devices.sim.scene import SceneObject
+from tofcapture.devices.sim.shapes import FAMILIES
+from tofcapture.devices.sim.shapes.made import board
+from tofcapture.devices.sim.shapes.mesh import Mesh, circle, cuboid, extrude, move, settle
+from tofcapture.devices.sim.shapes.turned import ball
+from tofcapture.errors import ConfigError
+from tofcapture.poses import Float64, rotation_exp, transform
+
+CALIBRATION = "calibration"
+TABLE_CENTRE = np.array([0.70, 0.0, -0.50])  # m, base frame, on the table top
+BOARD_CENTRE = TABLE_CENTRE + [0.0, 0.0, 0.28]
+BOARD_TILT = np.radians(-15.0)  # about base y: the board leans towards the arm
+_TABLE = (1.2, 1.6, 0.04)  # m
+_FLOOR = -1.2  # m, z in the base frame
+_REACH = 0.16  # m; targets stay this close to the table's centre
+
+
+def generator(name: str, seed: int, purpose: str) -> np.random.Generator:
+    """Independent generator for one purpose of one scene; the same on every machine."""
+    digest = hashlib.sha256(f"{purpose}|{seed}|{name}".encode()).digest()
+    return np.random.default_rng(np.frombuffer(digest, dtype="<u4").tolist())
+
+
+def scene_objects(
+    name: str, seed: int, meshes: Mapping[str, Path] | None = None, mesh_unit: str = "m"
+) -> list[SceneObject]:
+    """Everything that stands in a scene, in the base frame.
+
+    Parameters
+    ----------
+    name
+        ``calibration`` for the board; a mesh's name; a family of :data:`shapes.FAMILIES`, optionally with ``-<n>`` behind
+        it (``mug``, ``mug-2``); anything else is a seeded combination of one to four objects (``random-7``).
+    seed
+        The world's seed.
+    meshes
+        Name -> PLY, OBJ or STL file.
+    mesh_unit
+        Unit of those files: ``m``, ``cm`` or ``mm``.
+
+    Returns
+    -------
+    list of SceneObject
+        Objects (``target=True``), then table, pedestal, walls and clutter.
+    """
+    if name == CALIBRATION:
+        return [*_calibration(), *_surroundings(name, seed, clutter=False)]
+    rng = generator(name, seed, "objects")
+    if meshes and name in meshes:
+        items = [(name, _read(meshes[name], mesh_unit))]
+    else:
+        items = [(family, FAMILIES[family](rng)) for family in _families(name, rng)]
+    return [*_arranged(items, rng), *_surroundings(name, seed, clutter=True)]
+
+
+def _families(name: str, rng: np.random.Generator) -> list[str]:
+    """Families of a scene's objects."""
+    stem = re.sub(r"-\d+$", "", name)
+    if stem in FAMILIES:
+        return [stem]
+    choice = [f for f in FAMILIES if f != "board"]
+    count = int(rng.choice([1, 2, 3, 4], p=[0.2, 0.35, 0.25, 0.2]))
+    return [choice[int(i)] for i in rng.choice(len(choice), size=count, replace=False)]
+
+
+def _read(path: Path, unit: str) -> Mesh:
+    """Read a mesh file, resting on z = 0; its size tells whether the unit can be right."""
+    mesh = settle(read_mesh(path, unit))
+    size = float(np.ptp(mesh[0], axis=0).max())
+    if not 0.005 < size < 1.0:
+        raise ConfigError(f"{path}: {size:.4g} m is no size for an object on the table", hint="set mesh_unit to m, cm or mm")
+    return mesh
+
+
+def _arranged(items: Sequence[tuple[str, Mesh]], rng: np.random.Generator) -> list[SceneObject]:
+    """Stand objects on the table, turned at random, side by side."""
+    out: list[SceneObject] = []
+    discs: list[tuple[Float64, float]] = []
+    for name, (vertices, triangles) in items:
+        radius = float(np.linalg.norm(vertices[:, :2], axis=1).max())
+        place = _free_place(radius, discs, rng)
+        if place is None:
+            continue
+        discs.append((place, radius))
+        T = transform(rotation_exp([0, 0, rng.uniform(-np.pi, np.pi)]), TABLE_CENTRE + [*place, 0.0])
+        out.append(SceneObject(vertices, triangles, float(rng.uniform(0.15, 0.9)), T, target=True, name=name))
+    return out
+
+
+def _free_place(
+    radius: float, discs: Sequence[tuple[Float64, float]], rng: np.random.Generator
+) -> Float64 | None:
+    """(2,) place near the centre where a disc touches no other, or None when forty tries find none; the first is central."""
+    if not discs:
+        return rng.uniform(-0.02, 0.02, 2)
+    for reach in np.linspace(0.06, _REACH, 40):
+        angle = rng.uniform(0, 2 * np.pi)
+        place = reach * np.array([np.cos(angle), np.sin(angle)])
+        if all(np.linalg.norm(place - other) > radius + r + 0.005 for other, r in discs):
+            return place
+    return None
+
+
+def _solid(name: str, mesh: Mesh, albedo: float, at: ArrayLike, turn: ArrayLike = (0, 0, 0), *, target: bool = False) -> SceneObject:
+    """Stand a mesh somewhere; ``turn`` is a rotation vector."""
+    T = transform(rotation_exp(turn), np.asarray(at, dtype=np.float64))
+    return SceneObject(mesh[0], mesh[1], float(albedo), T, target=target, name=name)
+
+
+def _calibration() -> list[SceneObject]:
+    """Board with cut-outs on a stand, and four solids whose slopes hold a registration in the board's plane.
+
+    The board leans towards the arm, well above the table, so that cut-outs and outline stand before a clear background;
+    nothing faces its front, so hardly any light reaches it by way of other surfaces.
+    """
+    plate = move(board(), transform(np.eye(3), [0, 0, -0.005]))
+    block = move(cuboid(0.16, 0.12, 0.10), transform(rotation_exp([0.6, 0.0, 0.0]), [0, 0, 0]))
+    pyramid = extrude(circle(0.11, segments=5), 0.16)
+    pyramid = (pyramid[0] * np.where(pyramid[0][:, 2:] > 0, [0.25, 0.25, 1], [1.0, 1.0, 1]), pyramid[1])
+    ridge = move(extrude(np.array([[-0.1, 0], [0.1, 0], [0.0, 0.1]]), 0.18), transform(rotation_exp([np.pi / 2, 0, 0]), [0, 0, 0]))
+    at = TABLE_CENTRE
+    return [
+        _solid("board", plate, 0.7, BOARD_CENTRE, (0, BOARD_TILT, 0), target=True),
+        *(_leg(x, y) for x, y in ((-0.06, 0.04), (0.12, 0.05), (-0.03, -0.16))),
+        _solid("ball", ball(0.085), 0.6, at + [0.06, 0.36, 0.0], target=True),
+        _solid("block", settle(block), 0.45, at + [-0.13, 0.40, 0.0], (0, 0, 0.5), target=True),
+        _solid("pyramid", settle(pyramid), 0.65, at + [-0.10, -0.38, 0.0], (0, 0, 0.3), target=True),
+        _solid("ridge", settle(ridge), 0.5, at + [0.15, -0.38, 0.0], (0, 0, 0.8), target=True),
+        _solid("peg", extrude(circle(0.05, segments=48), 0.12), 0.55, at + [0.36, 0.02, 0.0], target=True),
+    ]  # fmt: skip
+
+
+def _leg(x: float, y: float) -> SceneObject:
+    """Round leg under the board's point (x, y), between cut-outs; ends 3 mm below the plate."""
+    foot = TABLE_CENTRE + [x * np.cos(BOARD_TILT), y, 0.0]
+    height = BOARD_CENTRE[2] - TABLE_CENTRE[2] - x * np.sin(BOARD_TILT) - 0.005 - 0.003 - 0.004
+    return _solid("leg", extrude(circle(0.012, segments=24), height), 0.5, foot)
+
+
+def _surroundings(name: str, seed: int, *, clutter: bool) -> list[SceneObject]:
+    """Table, pedestal, floor, walls and boxes; where and how bright differs from scene to scene."""
+    rng = generator(name, seed, "surroundings")
+    x, y, z = TABLE_CENTRE
+    out = [
+        _solid("table", cuboid(*_TABLE), rng.uniform(0.2, 0.75), [x + 0.08, y, z - _TABLE[2]]),
+        _solid("pedestal", cuboid(0.2, 0.2, -_FLOOR - 0.02), 0.4, [0, 0, _FLOOR]),
+        _solid("floor", cuboid(6, 6, 0.1), rng.uniform(0.15, 0.6), [x, y, _FLOOR - 0.1]),
+    ]
+    if not clutter or rng.random() < 0.85:
+        out.append(_solid("back wall", cuboid(0.1, 6, 3.2), rng.uniform(0.3, 0.85), [rng.uniform(1.9, 3.0), 0, _FLOOR]))
+    for side in (-1, 1):
+        if rng.random() < 0.5:
+            far = side * rng.uniform(1.4, 2.6)
+            out.append(_solid("side wall", cuboid(6, 0.1, 3.2), rng.uniform(0.3, 0.85), [x, far, _FLOOR]))
+    if clutter:
+        out += [_clutter(rng) for _ in range(int(rng.integers(0, 6)))]
+    return out
+
+
+def _clutter(rng: np.random.Generator) -> SceneObject:
+    """One box, at the table's far edges or on the floor behind it."""
+    side = rng.choice([-1.0, 1.0])
+    turn = (0.0, 0.0, rng.uniform(-np.pi, np.pi))
+    if rng.random() < 0.5:
+        size = rng.uniform([0.06, 0.06, 0.04], [0.2, 0.2, 0.25])
+        return _solid("clutter", cuboid(*size), rng.uniform(0.15, 0.9), TABLE_CENTRE + [rng.uniform(-0.2, 0.5), side * rng.uniform(0.5, 0.66), 0], turn)  # fmt: skip
+    size = rng.uniform([0.2, 0.2, 0.3], [0.5, 0.5, 1.0])
+    return _solid("clutter", cuboid(*size), rng.uniform(0.15, 0.9), [rng.uniform(0.3, 1.6), side * rng.uniform(1.15, 1.3), _FLOOR], turn)  # fmt: skip

@@ -1,0 +1,162 @@
+"""A station: one arm, one ToF camera, one stereo camera, one operator, opened together.
+
+::
+
+    with open_station(Path("station.toml")) as station:
+        station.arm.move_to(joints)
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tofcapture.devices import Arm, Operator, StereoDevice, TofCamera
+from tofcapture.devices.registry import ROLES, StationContext, make_device
+from tofcapture.errors import ConfigError, DeviceError, TofError
+from tofcapture.files.info import stereo_table, tof_table
+from tofcapture.rig import Rig, load_rig
+
+_TABLES = (*ROLES, "sim", "plan", "rig")
+DEFAULT = Path(__file__).with_name("station.toml")
+
+
+@dataclass(frozen=True)
+class Station:
+    """Open devices.
+
+    Attributes
+    ----------
+    arm, tof, stereo, operator
+        The devices.
+    rig
+        The rig as it is known before alignment: a drawing, or an earlier ``rig.toml``.
+    config
+        The effective ``station.toml``.
+    """
+
+    arm: Arm
+    tof: TofCamera
+    stereo: StereoDevice
+    operator: Operator
+    rig: Rig
+    config: Mapping[str, Any]
+
+    @property
+    def seed(self) -> int:
+        """Seed of the simulated world and of the view plan."""
+        return int(self.config.get("sim", {}).get("seed", 0))
+
+    @property
+    def simulated(self) -> bool:
+        """True when no real arm moves."""
+        return bool(getattr(self.arm, "simulated", False))
+
+    def describe(self) -> dict[str, Any]:
+        """Say which devices these are, as JSON types; equal for the same devices."""
+        arm = self.arm.describe()
+        return {
+            "arm": {"model": arm.model, "serial": arm.serial},
+            "tof": tof_table(self.tof.describe()),
+            "stereo": stereo_table(self.stereo.describe()),
+        }
+
+
+def read_station(path: Path | None, seed: int | None = None) -> dict[str, Any]:
+    """Read ``station.toml``, or the embedded simulated station, and check its tables.
+
+    Parameters
+    ----------
+    path
+        The file; ``None`` for the embedded one.
+    seed
+        Replaces ``[sim] seed``.
+
+    Raises
+    ------
+    ConfigError
+        Unreadable, not TOML, unknown or misplaced tables.
+    """
+    where = path or DEFAULT
+    try:
+        config = tomllib.loads(where.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
+        raise ConfigError(f"{where}: cannot read the station: {err}", hint="leave --station out for the simulated one") from err
+    wrong = [key for key, table in config.items() if key not in _TABLES or not isinstance(table, Mapping)]
+    if wrong:
+        raise ConfigError(f"{where}: expected the tables {', '.join(_TABLES)}, got {', '.join(wrong)}")
+    if seed is not None:
+        config["sim"] = {**config.get("sim", {}), "seed": seed}
+    return config
+
+
+@contextmanager
+def open_station(path: Path | None = None, seed: int | None = None) -> Iterator[Station]:
+    """Open every device of a station; on leaving, stop the arm after an error, and close all in reverse order.
+
+    Parameters
+    ----------
+    path
+        ``station.toml``; ``None`` for the embedded simulated station.
+    seed
+        Replaces ``[sim] seed``.
+
+    Raises
+    ------
+    ConfigError
+        The file is wrong.
+    DeviceError
+        Devices do not open; the message names all of them.
+    """
+    config = read_station(path, seed)
+    context = StationContext(config=config, folder=(path or DEFAULT).resolve().parent)
+    with ExitStack() as stack:
+        devices = _open_all(context, stack)
+        station = Station(**devices, rig=_rig(context), config=config)
+        try:
+            yield station
+        except BaseException:
+            station.arm.stop()
+            raise
+
+
+def _open_all(context: StationContext, stack: ExitStack) -> dict[str, Any]:
+    """Make and open each device; one error that names every device that failed."""
+    devices: dict[str, Any] = {}
+    failures: list[tuple[str, TofError]] = []
+    for role in ROLES:
+        try:
+            device = make_device(role, context)
+            # An operator has nothing to open, unless its driver says so.
+            devices[role] = stack.enter_context(device) if hasattr(device, "__enter__") else device
+        except TofError as err:
+            failures.append((role, err))
+        except Exception as err:
+            failures.append((role, DeviceError(f"{type(err).__name__}: {err}")))
+    if failures:
+        _refuse(failures)
+    return devices
+
+
+def _refuse(failures: list[tuple[str, TofError]]) -> None:
+    """Raise all failures as one."""
+    kind = ConfigError if all(isinstance(err, ConfigError) for _, err in failures) else DeviceError
+    text = "; ".join(f"{role}: {err.message}" for role, err in failures)
+    hints = dict.fromkeys(err.hint for _, err in failures if err.hint)
+    raise kind(f"{len(failures)} of {len(ROLES)} devices do not open: {text}", hint="; ".join(hints))
+
+
+def _rig(context: StationContext) -> Rig:
+    """Load the named rig; the simulated world knows a nominal one."""
+    if path := context.config.get("rig", {}).get("path"):
+        return load_rig(context.folder / str(path))
+    if "sim" in context.shared:
+        rig: Rig = context.shared["sim"].nominal_rig()
+        return rig
+    raise ConfigError(
+        'station: expected [rig] path = "rig.toml"', hint="the bracket's drawing does for a start; see docs/formats.md"
+    )

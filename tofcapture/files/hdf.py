@@ -1,0 +1,143 @@
+"""Fields of a layout as HDF5 datasets, and files opened with every failure named."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.errors import DataError, FormatError
+from tofcapture.files.layout import Field, Layout
+
+Array = NDArray[Any]
+
+
+def create(file: h5py.File, field: Field, shape: tuple[int, ...], dtype: str | np.dtype[Any], gzip: int) -> h5py.Dataset:
+    """Create a field's dataset; the same calls give the same bytes (no time stamps).
+
+    Parameters
+    ----------
+    file
+        Open for writing.
+    field
+        What to create.
+    shape, dtype
+        The dtype must be one that the field allows.
+    gzip
+        Level 1 to 9 for chunked fields.
+    """
+    if np.dtype(dtype).name not in field.dtypes:
+        raise FormatError(f"/{field.path}: expected {' or '.join(field.dtypes)}, got {np.dtype(dtype).name}")
+    storage: dict[str, Any] = {}
+    if field.chunk is not None:
+        chunks = (1,) * field.chunk + shape[field.chunk :]
+        storage = {"chunks": chunks, "shuffle": True, "compression": "gzip", "compression_opts": gzip, "fletcher32": True}
+    dataset = file.create_dataset(field.path, shape, dtype, track_times=False, **storage)
+    dataset.attrs["units"] = field.units
+    dataset.attrs["description"] = field.doc
+    return dataset
+
+
+def write_attrs(file: h5py.File, layout: Layout, values: Mapping[str, Any]) -> None:
+    """Write the root attributes of a layout; JSON kinds are serialised, format and version come from the layout."""
+    known = {"format": layout.format, "version": layout.version, "units": "m", **values}
+    for name, kind, _ in layout.attrs:
+        file.attrs[name] = dumps(known[name]) if kind == "JSON" else known[name]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"expected JSON types, got {type(value).__name__}")
+
+
+def dumps(value: Any) -> str:
+    """Write JSON with sorted keys; numpy scalars and arrays become plain numbers, floats keep every bit."""
+    return json.dumps(value, sort_keys=True, default=_plain)
+
+
+def open_checked(path: Path, layout: Layout, **options: Any) -> h5py.File:
+    """Open a file for reading and make sure that it is what the layout says.
+
+    Raises
+    ------
+    DataError
+        Missing, truncated, or not HDF5.
+    FormatError
+        HDF5 of another format or version.
+    """
+    try:
+        file = h5py.File(path, "r", **options)
+    except FileNotFoundError as err:
+        raise DataError(f"{path}: expected a {layout.format} file, found nothing there") from err
+    except (OSError, RuntimeError, ValueError) as err:
+        raise DataError(f"{path}: cannot be opened as HDF5: {err}", hint=f"tofcapture check {path}") from err
+    try:
+        _check_format(file, path, layout)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _check_format(file: h5py.File, path: Path, layout: Layout) -> None:
+    found, version = text_attr(file, "format", path), attr(file, "version", path)
+    if found != layout.format:
+        raise FormatError(f"{path}: expected format {layout.format}, got {found!r}")
+    if version != layout.version:
+        raise FormatError(
+            f"{path}: expected {layout.format} version {layout.version}, got {version}",
+            hint="a newer tofcapture wrote it: upgrade" if version > layout.version else "convert it or record it again",
+        )
+
+
+def attr(file: h5py.File, name: str, path: Path) -> Any:
+    """Read a root attribute, or say that it is missing or damaged."""
+    try:
+        return file.attrs[name]
+    except (KeyError, OSError, RuntimeError, ValueError, TypeError) as err:
+        raise FormatError(f"{path}: expected the attribute {name!r}, cannot read it: {err}") from err
+
+
+def text_attr(file: h5py.File, name: str, path: Path) -> str:
+    """Read a root attribute that must be text."""
+    value = attr(file, name, path)
+    if not isinstance(value, str):
+        raise FormatError(f"{path}: expected the attribute {name!r} to be text, got {type(value).__name__}")
+    return value
+
+
+def json_attr(file: h5py.File, name: str, path: Path) -> Any:
+    """Read a root attribute that holds JSON."""
+    try:
+        return json.loads(text_attr(file, name, path))
+    except json.JSONDecodeError as err:
+        raise FormatError(f"{path}: attribute {name!r} is not JSON: {err}") from err
+
+
+def fetch(file: h5py.File, field: Field, path: Path) -> Array:
+    """Read a whole dataset.
+
+    Raises
+    ------
+    FormatError
+        When it is missing or of another dtype.
+    DataError
+        When its bytes are damaged (Fletcher-32).
+    """
+    dataset = file.get(field.path)
+    if not isinstance(dataset, h5py.Dataset):
+        raise FormatError(f"{path}: expected the dataset /{field.path}, found none")
+    if dataset.dtype.name not in field.dtypes:
+        raise FormatError(f"{path}: /{field.path}: expected {' or '.join(field.dtypes)}, got {dataset.dtype.name}")
+    try:
+        return np.asarray(dataset[()])
+    except (OSError, RuntimeError, ValueError) as err:
+        raise DataError(f"{path}: /{field.path} is damaged: {err}", hint=f"tofcapture check {path}") from err

@@ -1,0 +1,178 @@
+"""View files: everything captured at one pose of one scene, written once.
+
+::
+
+    digest = write_view(view_path(recording, "mug", 7), view)
+    view = read_view(recording / "views/mug/view-007.h5")
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from tofcapture.errors import ConfigError, DataError, FormatError, TofError
+from tofcapture.files.hdf import Array, attr, create, fetch, json_attr, open_checked, text_attr, write_attrs
+from tofcapture.files.info import stereo_from, stereo_table, tof_from, tof_table
+from tofcapture.files.layout import VIEW, Field
+from tofcapture.files.seal import partial_path, seal
+from tofcapture.frames import ArmState, StereoFrame, TofBurst, Truth, View
+from tofcapture.rig import dumps_rig, loads_rig
+
+_GZIP = 1  # a view is written while the arm waits
+_SCENE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
+
+def check_scene_name(scene: str) -> str:
+    """Return the name of a scene, or refuse one that is no safe file name.
+
+    Raises
+    ------
+    ConfigError
+        Anything but 1 to 64 letters, digits, ``_``, ``.`` and ``-``, the first one a letter or digit.
+    """
+    if not _SCENE.fullmatch(scene):
+        raise ConfigError(
+            f"scene: expected 1 to 64 letters, digits, '_', '.' or '-', got {scene!r}", hint="for example: --scene mug-2"
+        )
+    return scene
+
+
+def view_path(recording: Path, scene: str, index: int) -> Path:
+    """Path of a view: ``RECORDING/views/<scene>/view-007.h5``."""
+    return Path(recording) / "views" / check_scene_name(scene) / f"view-{index:03d}.h5"
+
+
+def _arrays(view: View) -> dict[str, Array]:
+    arrays: dict[str, Any] = {
+        "tof/raw": view.tof.raw,
+        "tof/time_ns": np.asarray(view.tof.time_ns, dtype=np.int64),
+        "tof/celsius": np.asarray(view.tof.celsius, dtype=np.float64),
+        "stereo/points": view.stereo.points,
+        "stereo/time_ns": np.int64(view.stereo.time_ns),
+    }
+    for when, state in (("before", view.arm_before), ("after", view.arm_after)):
+        arrays[f"arm/{when}/joints"] = np.asarray(state.joints, dtype=np.float64)
+        arrays[f"arm/{when}/T_base_flange"] = np.asarray(state.T_base_flange, dtype=np.float64)
+        arrays[f"arm/{when}/time_ns"] = np.int64(state.time_ns)
+    if view.truth is not None:
+        for name in ("depth", "normals", "target", "T_tof_stereo", "T_flange_tof"):
+            arrays[f"truth/{name}"] = getattr(view.truth, name)
+    return {path: np.asarray(a) for path, a in arrays.items()}
+
+
+def _sizes(view: View) -> dict[str, int]:
+    F, K, H, W = view.tof.raw.shape
+    SH, SW = view.stereo.info.camera.shape
+    return {"F": F, "K": K, "H": H, "W": W, "SH": SH, "SW": SW}
+
+
+def _put(file: h5py.File, field: Field, data: Array, sizes: dict[str, int]) -> None:
+    if data.shape != field.shape(sizes):
+        raise FormatError(f"/{field.path}: expected shape {field.shape(sizes)}, got {data.shape}")
+    create(file, field, data.shape, data.dtype, _GZIP)[...] = data
+
+
+def _verify(path: Path, arrays: dict[str, Array]) -> None:
+    with open_checked(path, VIEW) as file:
+        for name, data in arrays.items():
+            if fetch(file, VIEW[name], path).tobytes() != data.tobytes():
+                raise DataError(f"{path}: /{name} read back differs from what was written", hint="check the disk")
+
+
+def write_view(path: Path, view: View) -> str:
+    """Write a view, verify it byte by byte, seal it read-only under its name.
+
+    Killed at any moment it leaves either no file of that name or a whole one. The same view gives the same bytes.
+
+    Parameters
+    ----------
+    path
+        Usually :func:`view_path`; folders are made, an older file of that name is replaced.
+    view
+        What to write.
+
+    Returns
+    -------
+    SHA-256 of the file, hexadecimal; also stored beside it.
+
+    Raises
+    ------
+    FormatError
+        When an array has a shape or dtype that the layout does not allow.
+    DataError
+        When what was read back is not what was written.
+    OSError
+        When the disk refuses (full, read-only).
+    """
+    path = Path(path)
+    check_scene_name(view.scene)
+    arrays, sizes, partial = _arrays(view), _sizes(view), partial_path(path)
+    attrs = {
+        "scene": view.scene,
+        "index": view.index,
+        "rig": dumps_rig(view.rig),
+        "tof_info": tof_table(view.tof.info),
+        "stereo_info": stereo_table(view.stereo.info),
+        "provenance": dict(view.provenance),
+    }
+    try:
+        with h5py.File(partial, "w") as file:
+            write_attrs(file, VIEW, attrs)
+            for name, data in arrays.items():
+                _put(file, VIEW[name], data, sizes)
+        _verify(partial, arrays)
+        return seal(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_view(path: Path) -> View:
+    """Read a view back, bit by bit what was written.
+
+    Raises
+    ------
+    DataError
+        Missing, truncated, not HDF5, or damaged data; the message names the file and the dataset.
+    FormatError
+        Another format or version, a dataset missing, or shapes that contradict each other.
+    """
+    path = Path(path)
+    with open_checked(path, VIEW) as file:
+        try:
+            return _read(file, path)
+        except DataError as err:
+            raise err if str(path) in err.message else type(err)(f"{path}: {err.message}", err.hint) from err
+        except TofError as err:
+            raise FormatError(f"{path}: {err.message}", hint=f"tofcapture check {path}") from err
+
+
+def _read(file: h5py.File, path: Path) -> View:
+    def get(name: str) -> Array:
+        return fetch(file, VIEW[name], path)
+
+    def arm(when: str) -> ArmState:
+        return ArmState(get(f"arm/{when}/joints"), get(f"arm/{when}/T_base_flange"), int(get(f"arm/{when}/time_ns")))
+
+    tof_info = tof_from(json_attr(file, "tof_info", path), str(path))
+    stereo_info = stereo_from(json_attr(file, "stereo_info", path), str(path))
+    return View(
+        scene=text_attr(file, "scene", path),
+        index=int(attr(file, "index", path)),
+        tof=TofBurst(get("tof/raw"), get("tof/time_ns"), get("tof/celsius"), tof_info),
+        stereo=StereoFrame(get("stereo/points"), int(get("stereo/time_ns")), stereo_info),
+        arm_before=arm("before"),
+        arm_after=arm("after"),
+        rig=loads_rig(text_attr(file, "rig", path), f"{path}: rig"),
+        provenance=json_attr(file, "provenance", path),
+        truth=_truth(file, path) if "truth" in file else None,
+    )
+
+
+def _truth(file: h5py.File, path: Path) -> Truth:
+    names = ("depth", "normals", "target", "T_tof_stereo", "T_flange_tof")
+    return Truth(**{name: fetch(file, VIEW[f"truth/{name}"], path) for name in names})

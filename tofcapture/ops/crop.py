@@ -1,0 +1,151 @@
+"""Find the table and say what stands on it.
+
+The table is the dominant plane among the points around the optical axis; the scene's object is what stands above it, not
+far from where the camera looks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.poses import Float64
+
+Bool = NDArray[np.bool_]
+
+TRIALS = 200
+SAMPLE = 20_000  # points that vote
+INLIER = 0.004  # m
+DOMINANT = 0.2  # share of the voting points below which there is no table
+
+
+@dataclass(frozen=True)
+class Crop:
+    """Where the scene's object is, ToF frame.
+
+    Attributes
+    ----------
+    normal, offset
+        Table plane ``normal . p = offset``, unit normal towards the camera, metres; ``normal`` is NaN when there is no
+        dominant plane.
+    centre
+        (3,) what the camera looks at, metres.
+    radius
+        Largest distance from the centre along the table, metres.
+    clearance
+        Smallest height above the table, metres.
+    far
+        Largest depth, metres.
+    """
+
+    normal: Float64
+    offset: float
+    centre: Float64
+    radius: float
+    clearance: float
+    far: float
+
+
+def _plane_of(points: Float64) -> tuple[Float64, float]:
+    """Least-squares plane of (N, 3) points, its normal towards the origin's side."""
+    mean = points.mean(axis=0)
+    normal = np.linalg.eigh(np.cov((points - mean).T))[1][:, 0]
+    normal = normal if normal @ mean < 0 else -normal
+    return normal, float(normal @ mean)
+
+
+def _candidates(points: Float64, rng: np.random.Generator) -> tuple[Float64, Float64]:
+    """Planes (T, 3), (T,) through random triples."""
+    a, b, c = np.moveaxis(points[rng.integers(0, len(points), (TRIALS, 3))], 1, 0)
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    normals = normals[length > 1e-9] / length[length > 1e-9, None]
+    return normals, np.einsum("tc,tc->t", normals, a[length > 1e-9])
+
+
+def dominant_plane(points: Float64, rng: np.random.Generator) -> tuple[Float64, float, float] | None:
+    """Find the plane that most points (N, 3) lie on.
+
+    RANSAC over {TRIALS} triples, then two rounds of least squares over the inliers.
+
+    Parameters
+    ----------
+    points
+        (N, 3) finite, metres.
+    rng
+        Draws the triples; the same generator state gives the same plane.
+
+    Returns
+    -------
+    Unit normal (3,) towards the origin, offset, and the inliers' RMS distance in metres; ``None`` when fewer than a
+    fifth of the points agree on any plane.
+    """
+    if len(points) < 50:
+        return None
+    points = points[:: max(1, len(points) // SAMPLE)]
+    normals, offsets = _candidates(points, rng)
+    if len(normals) == 0:
+        return None
+    votes = (np.abs(points[:: max(1, len(points) // 4000)] @ normals.T - offsets) < INLIER).sum(axis=0)
+    best = int(votes.argmax())
+    normal, offset = normals[best], float(offsets[best])
+    for _ in range(3):
+        inliers = points[np.abs(points @ normal - offset) < INLIER]
+        if len(inliers) < max(10, DOMINANT * len(points)):
+            return None
+        normal, offset = _plane_of(inliers)
+    return normal, offset, float(np.sqrt(np.mean((inliers @ normal - offset) ** 2)))
+
+
+def find_crop(
+    points: NDArray[np.floating], rng: np.random.Generator, radius: float = 0.35, far: float = 2.0
+) -> Crop:
+    """Find the table and the region above it that holds the scene's object.
+
+    Parameters
+    ----------
+    points
+        (..., 3), ToF frame, metres; NaN: not measured.
+    rng
+        For the plane search.
+    radius
+        Largest distance of the object from the point the camera looks at, along the table, metres.
+    far
+        Largest depth, metres.
+
+    Returns
+    -------
+    Crop
+        Without a dominant plane it keeps everything within ``far``.
+    """
+    cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    cloud = cloud[np.isfinite(cloud[:, 2]) & (cloud[:, 2] > 0) & (cloud[:, 2] < far)]
+    found = dominant_plane(cloud, rng)
+    if found is None:
+        return Crop(np.full(3, np.nan), np.nan, np.zeros(3), np.inf, 0.0, far)
+    normal, offset, rms = found
+    depth = offset / normal[2] if abs(normal[2]) > 0.1 else np.inf  # where the optical axis meets the table
+    axis = np.array([0.0, 0.0, depth if 0 < depth < far else float(np.median(cloud[:, 2]))])
+    return Crop(normal, offset, axis, radius, max(0.003, 5 * rms), far)
+
+
+def inside(crop: Crop, points: NDArray[np.floating]) -> Bool:
+    """Say which points (..., 3) belong to the scene's object; NaN points do not.
+
+    Parameters
+    ----------
+    crop
+        From :func:`find_crop`.
+    points
+        ToF frame, metres.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    near: Bool = (points[..., 2] > 0) & (points[..., 2] < crop.far)
+    if not np.isfinite(crop.offset):
+        return near
+    height = points @ crop.normal - crop.offset
+    along = (points - crop.centre) - ((points - crop.centre) @ crop.normal)[..., None] * crop.normal
+    out: Bool = near & (height > crop.clearance) & (np.linalg.norm(along, axis=-1) < crop.radius)
+    return out

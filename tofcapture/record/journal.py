@@ -1,0 +1,281 @@
+"""The recording's journal: one row per view, in SQLite; who writes it holds the recording.
+
+The journal says what should be there and what is; the sealed files themselves are the truth. At start both are reconciled:
+a sealed file without a row is verified and adopted, a row without a file is planned again, leftovers of a killed writer go.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from tofcapture.errors import BusyError, ConfigError, DataError
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS view (
+    scene TEXT NOT NULL, number INTEGER NOT NULL, pose TEXT NOT NULL,
+    state TEXT NOT NULL CHECK (state IN ('planned', 'sealed', 'failed')),
+    sha256 TEXT, attempts INTEGER NOT NULL DEFAULT 0, reason TEXT NOT NULL DEFAULT '',
+    planned_utc TEXT NOT NULL, changed_utc TEXT NOT NULL,
+    PRIMARY KEY (scene, number)
+);
+CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What the journal says of one view; ``pose`` is the planned view's digest."""
+
+    scene: str
+    index: int
+    pose: str
+    state: str
+    sha256: str | None
+    attempts: int
+    reason: str
+
+
+def utc_now() -> str:
+    """Time of day as the journal and the files write it: ISO 8601, UTC, whole seconds."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def journal_path(recording: Path) -> Path:
+    """``RECORDING/journal.sqlite``."""
+    return Path(recording) / "journal.sqlite"
+
+
+@contextmanager
+def hold(recording: Path) -> Iterator[None]:
+    """Hold a recording for writing; the lock goes with the process, however that ends.
+
+    Raises
+    ------
+    BusyError
+        When another recorder holds it.
+    """
+    import fcntl
+
+    # Not the database itself: closing any handle of it would drop SQLite's own locks.
+    with (recording / ".lock").open("a+", encoding="ascii") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as err:
+            file.seek(0)
+            holder = file.read().strip() or "unknown"
+            raise BusyError(f"{recording}: another recorder (process {holder}) is at work", hint="wait for it to end") from err
+        file.truncate(0)
+        file.write(str(_pid()))
+        file.flush()
+        yield
+
+
+def _pid() -> int:
+    import os
+
+    return os.getpid()
+
+
+class Journal:
+    """Open journal of a recording; one transaction per call, on disk when the call returns.
+
+    Parameters
+    ----------
+    recording
+        The folder; must exist.
+    """
+
+    def __init__(self, recording: Path) -> None:
+        path = journal_path(recording)
+        try:
+            self._db = sqlite3.connect(path, isolation_level=None)
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute("PRAGMA synchronous=FULL")
+            self._db.executescript(_SCHEMA)
+        except sqlite3.DatabaseError as err:
+            raise DataError(f"{path}: not a journal: {err}", hint="move it away: it is rebuilt from the view files") from err
+
+    def close(self) -> None:
+        """Close the database."""
+        self._db.close()
+
+    def rows(self, scene: str | None = None) -> list[Row]:
+        """All rows, or those of one scene, by scene and number."""
+        where, values = ("WHERE scene = ?", (scene,)) if scene else ("", ())
+        found = self._db.execute(
+            f"SELECT scene, number, pose, state, sha256, attempts, reason FROM view {where} ORDER BY scene, number",  # noqa: S608
+            values,
+        )
+        return [Row(*row) for row in found]
+
+    def agree(self, facts: Mapping[str, Any]) -> None:
+        """Remember facts of the recording, or compare with the remembered ones.
+
+        Parameters
+        ----------
+        facts
+            Name -> JSON types: cameras, frames per burst ...
+
+        Raises
+        ------
+        ConfigError
+            When a fact differs from what the recording was begun with.
+        """
+        for key, value in facts.items():
+            text = json.dumps(value, sort_keys=True)
+            self._db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?)", (key, text))
+            known = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()[0]
+            if known != text:
+                raise ConfigError(
+                    f"the recording was begun with another {key}: expected {_first_difference(json.loads(known), value)}",
+                    hint="go on with the same station and options, or record into another folder",
+                )
+
+    def expect(self, scene: str, poses: Mapping[int, str]) -> None:
+        """Note planned views (index -> digest of the pose).
+
+        Raises
+        ------
+        ConfigError
+            When a view of that number was recorded at another pose.
+        """
+        for row in self.rows(scene):
+            if row.state == "sealed" and row.pose and poses.get(row.index, row.pose) != row.pose:
+                raise ConfigError(
+                    f"view {row.index} of {scene!r} was recorded at pose {row.pose}, the plan wants {poses[row.index]}",
+                    hint="use the same --seed and --station as before, or record into another folder",
+                )
+        now = utc_now()
+        self._db.execute("BEGIN")
+        for index, pose in poses.items():
+            self._db.execute(
+                "INSERT INTO view (scene, number, pose, state, planned_utc, changed_utc) VALUES (?, ?, ?, 'planned', ?, ?) "
+                "ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'planned', changed_utc = excluded.changed_utc "
+                "WHERE state != 'sealed'",
+                (scene, index, pose, now, now),
+            )
+        self._db.execute("COMMIT")
+
+    def attempt(self, scene: str, index: int) -> None:
+        """Count one more attempt, before anything moves."""
+        self._set(scene, index, "attempts = attempts + 1")
+
+    def seal(self, scene: str, index: int, sha256: str) -> None:
+        """Note that a view is on disk under its name."""
+        self._set(scene, index, "state = 'sealed', reason = '', sha256 = ?", sha256)
+
+    def fail(self, scene: str, index: int, reason: str) -> None:
+        """Note that a view was given up."""
+        self._set(scene, index, "state = 'failed', reason = ?", reason)
+
+    def forget(self, scene: str, index: int, reason: str) -> None:
+        """Plan a view again whose file is gone."""
+        self._set(scene, index, "state = 'planned', sha256 = NULL, reason = ?", reason)
+
+    def adopt(self, scene: str, index: int, pose: str, sha256: str) -> None:
+        """Note a verified file that the journal did not know to be sealed."""
+        now = utc_now()
+        self._db.execute(
+            "INSERT INTO view (scene, number, pose, state, sha256, planned_utc, changed_utc) VALUES (?, ?, ?, 'sealed', ?, ?, ?) "
+            "ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'sealed', sha256 = excluded.sha256, reason = ''",
+            (scene, index, pose, sha256, now, now),
+        )
+
+    def _set(self, scene: str, index: int, change: str, *values: object) -> None:
+        self._db.execute(
+            f"UPDATE view SET {change}, changed_utc = ? WHERE scene = ? AND number = ?",  # noqa: S608
+            (*values, utc_now(), scene, index),
+        )
+
+
+def _first_difference(known: Any, now: Any, where: str = "") -> str:
+    """Say where two JSON values first differ: ``.serial = 'A', got 'B'``."""
+    if isinstance(known, dict) and isinstance(now, dict):
+        for key in sorted({*known, *now}):
+            if known.get(key) != now.get(key):
+                return _first_difference(known.get(key), now.get(key), f"{where}.{key}")
+    return f"{where.lstrip('.') or 'value'} = {known!r}, got {now!r}"
+
+
+def reconcile(journal: Journal, recording: Path, scenes: Iterable[str] | None = None) -> list[str]:
+    """Make journal and files agree; see the module's first lines.
+
+    Parameters
+    ----------
+    journal, recording
+        Both held by this process.
+    scenes
+        Only these; all by default.
+
+    Returns
+    -------
+    One sentence for each thing that was put right.
+    """
+    views = recording / "views"
+    folders = sorted(p for p in views.iterdir() if p.is_dir()) if views.is_dir() else []
+    if scenes is not None:
+        folders = [p for p in folders if p.name in set(scenes)]
+    done: list[str] = []
+    sealed = {(row.scene, row.index): row.sha256 for row in journal.rows() if row.state == "sealed"}
+    for folder in folders:
+        done += _sweep(folder)
+        done += _adopt(journal, folder, sealed)
+    return done + _miss(journal, recording, sealed, scenes)
+
+
+def _sweep(folder: Path) -> list[str]:
+    """Remove what killed writers left."""
+    stray = sorted(folder.glob("*.partial"))
+    for path in stray:
+        path.unlink()
+    return [f"{path}: removed, it was never finished" for path in stray]
+
+
+def _adopt(journal: Journal, folder: Path, sealed: Mapping[tuple[str, int], str | None]) -> list[str]:
+    """Take whole files that the journal does not know; set damaged ones aside."""
+    from tofcapture.files.seal import verify_digest
+    from tofcapture.files.view import read_view
+
+    done = []
+    for path in sorted(folder.glob("view-*.h5")):
+        number = path.stem.removeprefix("view-")
+        if not number.isdigit() or (folder.name, int(number)) in sealed:
+            continue
+        try:
+            sha256 = verify_digest(path)
+            view = read_view(path)
+            if (view.scene, view.index) != (folder.name, int(number)):
+                raise DataError(f"{path}: it says it is view {view.index} of {view.scene!r}")
+            journal.adopt(folder.name, int(number), str(view.provenance.get("pose", "")), sha256)
+            done.append(f"{path}: adopted, it was sealed but not in the journal")
+        except DataError as err:
+            done.append(f"{path}: set aside as {_set_aside(path).name}: {err.message}")
+    return done
+
+
+def _set_aside(path: Path) -> Path:
+    """Rename a damaged file, so that its view can be taken again; nothing is ever deleted that might be data."""
+    aside = path.with_name(f"{path.name}.damaged")
+    path.rename(aside)
+    return aside
+
+
+def _miss(
+    journal: Journal, recording: Path, sealed: Mapping[tuple[str, int], str | None], scenes: Iterable[str] | None
+) -> list[str]:
+    """Plan sealed views again whose file is gone."""
+    from tofcapture.files.view import view_path
+
+    done = []
+    for scene, index in sealed:
+        if (scenes is None or scene in set(scenes)) and not view_path(recording, scene, index).exists():
+            journal.forget(scene, index, "the file was gone")
+            done.append(f"view {index} of {scene!r}: its file is gone, it will be taken again")
+    return done

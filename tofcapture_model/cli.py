@@ -1,0 +1,203 @@
+"""The commands ``train``, ``evaluate``, ``predict`` and ``report``. Nothing heavy is imported before one of them runs."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from tofcapture.command import Command, Outcome
+from tofcapture.errors import ConfigError
+from tofcapture_model.config import Config, load_config, preset, presets
+from tofcapture_model.progress import progress
+
+
+def _device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--device", default="cpu", help="torch device, such as cpu or cuda (default: cpu)")
+
+
+def _checked_device(name: str) -> str:
+    import torch
+
+    try:
+        torch.empty(0, device=name)
+    except (RuntimeError, AssertionError) as err:
+        raise ConfigError(
+            f"--device {name}: {str(err).splitlines()[0]}", hint="--device cpu always works"
+        ) from err
+    return name
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"expected a number > 0, got {text}")
+    return value
+
+
+def _count(text: str) -> int:
+    if int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number > 0, got {text}")
+    return int(text)
+
+
+def _configure_train(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", type=Path, help="folder that build-dataset wrote")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of the run; running again there goes on"
+    )
+    parser.add_argument(
+        "--preset", choices=presets(), default=None, help="where to start from (default: compact)"
+    )
+    parser.add_argument("--config", type=Path, help="TOML with differences from a preset")
+    parser.add_argument("--epochs", type=_count, help="of every stage, instead of the configuration's")
+    parser.add_argument("--minutes", type=_positive, help="train for so long; schedules follow the clock")
+    parser.add_argument("--seed", type=int, help="of weights, order and crops")
+    parser.add_argument(
+        "--workers", type=int, default=0, help="processes that read data (default: 0, data stays in memory)"
+    )
+    _device(parser)
+
+
+def _config(args: argparse.Namespace) -> Config:
+    if args.config and args.preset:
+        raise ConfigError(
+            "--config and --preset exclude each other", hint='write preset = "..." into the TOML'
+        )
+    config = load_config(args.config) if args.config else preset(args.preset or "compact")
+    return config if args.seed is None else replace(config, training=replace(config.training, seed=args.seed))
+
+
+def _train(args: argparse.Namespace) -> Outcome:
+    config = _config(args)
+    from tofcapture_model.train import train
+
+    with progress() as report:
+        done = train(
+            config,
+            args.dataset,
+            args.out,
+            epochs=args.epochs,
+            minutes=args.minutes,
+            device=_checked_device(args.device),
+            workers=args.workers,
+            report=report,
+        )
+    data: dict[str, Any] = {
+        "weights": str(done.path),
+        "steps": done.steps,
+        "finished": done.finished,
+        "losses": done.losses,
+    }
+    return Outcome(
+        data,
+        f"{done.path}: trained for {done.steps} steps\n  next: tofcapture evaluate {args.dataset} --weights {args.out}",
+    )
+
+
+def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", type=Path, help="folder that build-dataset wrote")
+    parser.add_argument(
+        "--weights", type=Path, help="checkpoint or folder of a run (default: the bundled weights)"
+    )
+    parser.add_argument("--out", type=Path, default=Path("results.json"), help="default: results.json")
+    parser.add_argument("--split", choices=("train", "val", "test"), default="test", help="default: test")
+    parser.add_argument(
+        "--frames", type=int, default=1, help="frames of every view; 0 takes all (default: 1)"
+    )
+    _device(parser)
+
+
+def _evaluate(args: argparse.Namespace) -> Outcome:
+    from tofcapture_model.evaluate import comparison, evaluate
+
+    with progress() as report:
+        results = evaluate(
+            args.dataset,
+            args.weights,
+            args.out,
+            split=args.split,
+            frames=args.frames,
+            device=_checked_device(args.device),
+            progress=lambda done, total: report("evaluate", done / total),
+        )
+    return Outcome({**results, "results": str(args.out)}, f"{comparison(results)}\n{args.out}")
+
+
+def _configure_predict(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "input", type=Path, help="view file or shard (.h5), or raw (8, H, W) or (F, 8, H, W) (.npy)"
+    )
+    parser.add_argument("--out", type=Path, default=Path("prediction"), help="folder (default: prediction)")
+    parser.add_argument(
+        "--weights", type=Path, help="checkpoint or folder of a run (default: the bundled weights)"
+    )
+    parser.add_argument("--view", type=int, default=0, help="of a shard (default: 0)")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--frame", type=int, default=0, help="of the burst (default: 0)")
+    which.add_argument(
+        "--average", action="store_true", help="take the mean of the burst instead of one frame"
+    )
+    parser.add_argument("--rig", type=Path, help="rig.toml for a .npy (default: nominal intrinsics)")
+    _device(parser)
+
+
+def _predict(args: argparse.Namespace) -> Outcome:
+    from tofcapture_model.predict import predict
+
+    result = predict(
+        args.input,
+        args.out,
+        weights=args.weights,
+        view=args.view,
+        frame=None if args.average else args.frame,
+        rig=args.rig,
+        device=_checked_device(args.device),
+    )
+    size = " x ".join(str(n) for n in reversed(result["shape"]))
+    text = f"{args.out}: depth, normals and expected error at {size}, network took {result['inference_ms']:.0f} ms"
+    return Outcome(result, text)
+
+
+def _configure_report(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--dataset", type=Path, help="folder that build-dataset wrote")
+    parser.add_argument("--results", type=Path, help="results.json of evaluate")
+    parser.add_argument("--evidence", type=Path, help="evidence.json of align")
+    parser.add_argument(
+        "--weights", type=Path, help="checkpoint or folder of a run (default: the bundled weights)"
+    )
+    parser.add_argument("--out", type=Path, default=Path("report.html"), help="default: report.html")
+
+
+def _report(args: argparse.Namespace) -> Outcome:
+    from tofcapture_model import report
+
+    outcome: Outcome = report.run(args)
+    return outcome
+
+
+TRAIN = Command(
+    "train a network on a dataset",
+    "tofcapture train dataset --out run --preset demo --minutes 3",
+    _configure_train,
+    _train,
+)
+EVALUATE = Command(
+    "measure the sensor and a network against ground truth",
+    "tofcapture evaluate dataset --weights run",
+    _configure_evaluate,
+    _evaluate,
+)
+PREDICT = Command(
+    "estimate depth and normals of one frame",
+    "tofcapture predict recording/views/mug/view-000.h5 --out prediction",
+    _configure_predict,
+    _predict,
+)
+REPORT = Command(
+    "write one HTML page with tables and pictures",
+    "tofcapture report --dataset dataset --results results.json --out report.html",
+    _configure_report,
+    _report,
+)

@@ -1,0 +1,300 @@
+"""What a training run is told: frozen dataclasses, TOML files that hold only differences from a preset.
+
+``preset = "compact"`` in a TOML file names its starting point; a preset itself is a TOML file in ``presets/`` that differs
+from the defaults below, which are the paper's.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tofcapture.errors import ConfigError
+
+STAGES = ("depth", "normal", "refine", "joint")
+SOURCES = {"raw": 8, "confidence": 1, "depth": 1}
+
+
+def _require(fine: bool, where: str, expected: str, got: object) -> None:
+    if not fine:
+        raise ConfigError(
+            f"{where}: expected {expected}, got {got}", hint="tofcapture_model/config.py lists every key"
+        )
+
+
+@dataclass(frozen=True)
+class Network:
+    """Which network.
+
+    Attributes
+    ----------
+    kind
+        ``paper``: three U-Nets; ``compact``: one small U-Net with three heads on classical features.
+    width, levels
+        Channels of the first level and number of levels of every U-Net.
+    inputs
+        What the paper's networks read, of ``raw``, ``confidence``, ``depth`` (paper, table IV).
+    windows
+        Radii in pixels of the side-window plane fits that ``compact`` reads.
+    max_residual
+        Metres by which the network may move a depth beyond its candidates; 0: any distance.
+    refine_iterations, refine_radius
+        Depth-normal-depth rounds, and taps to each side of the propagation window at twice the resolution.
+    """
+
+    kind: str = "paper"
+    width: int = 64
+    levels: int = 5
+    inputs: tuple[str, ...] = ("raw", "confidence", "depth")
+    windows: tuple[int, ...] = (2, 4)
+    max_residual: float = 0.0
+    refine_iterations: int = 2
+    refine_radius: int = 2
+
+    def __post_init__(self) -> None:
+        _require(self.kind in ("paper", "compact"), "network.kind", "paper or compact", self.kind)
+        _require(
+            self.width > 0 and 2 <= self.levels <= 6,
+            "network",
+            "width > 0, 2 to 6 levels",
+            (self.width, self.levels),
+        )
+        _require(
+            set(self.inputs) <= set(SOURCES) and len(self.inputs) > 0,
+            "network.inputs",
+            "some of raw, confidence, depth",
+            self.inputs,
+        )
+        _require(all(w > 0 for w in self.windows), "network.windows", "positive radii", self.windows)
+        _require(self.max_residual >= 0, "network.max_residual", "metres >= 0", self.max_residual)
+        _require(
+            self.refine_iterations >= 0 and self.refine_radius > 0,
+            "network.refine",
+            "iterations >= 0, radius > 0",
+            (self.refine_iterations, self.refine_radius),
+        )
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Weights and constants of the losses.
+
+    Attributes
+    ----------
+    delta
+        Metres, threshold of eq. 1.
+    jitter
+        Metres, of the robust Chamfer loss (eq. 2).
+    chamfer_radius
+        Pixels of the search window at twice the resolution; 0: as wide as the jitter needs.
+    depth, chamfer, error, normal
+        Weights of eq. 1, eq. 2 (in 1/mm^2), the error map, eq. 3.
+    context
+        Weight of measured surface outside the object crop relative to the object.
+    """
+
+    delta: float = 0.020
+    jitter: float = 0.010
+    chamfer_radius: int = 0
+    depth: float = 1.0
+    chamfer: float = 0.01
+    error: float = 1.0
+    normal: float = 1.0
+    context: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require(
+            self.delta > 0 and self.jitter >= 0, "losses", "delta > 0, jitter >= 0", (self.delta, self.jitter)
+        )
+        _require(
+            min(self.depth, self.chamfer, self.error, self.normal, self.context) >= 0,
+            "losses",
+            "weights >= 0",
+            self,
+        )
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of training: which parts learn (``depth``, ``normal``, ``refine``, ``joint``), how long, how fast."""
+
+    name: str
+    epochs: int
+    learning_rate: float = 1e-4
+
+    def __post_init__(self) -> None:
+        _require(self.name in STAGES, "stage.name", ", ".join(STAGES), self.name)
+        _require(
+            self.epochs > 0 and self.learning_rate > 0,
+            f"stage {self.name}",
+            "epochs and learning_rate > 0",
+            self,
+        )
+
+
+@dataclass(frozen=True)
+class Training:
+    """How to train.
+
+    Attributes
+    ----------
+    batch
+        Frames per step and process.
+    crop
+        (height, width) of training crops at sensor resolution; () takes whole frames.
+    flip
+        Mirror frames at random: right as far as the light source stands near the lens.
+    schedule
+        ``constant`` (paper) or ``cosine`` down to zero over each stage.
+    validate_every
+        Epochs between validations; 0: only at the end of each stage.
+    seed
+        Of weights, order and crops.
+    """
+
+    batch: int = 4
+    crop: tuple[int, ...] = ()
+    flip: bool = False
+    schedule: str = "constant"
+    validate_every: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _require(self.batch > 0, "training.batch", "> 0", self.batch)
+        _require(
+            len(self.crop) in (0, 2) and all(c >= 32 for c in self.crop),
+            "training.crop",
+            "[] or [height, width] >= 32",
+            self.crop,
+        )
+        _require(
+            self.schedule in ("constant", "cosine"), "training.schedule", "constant or cosine", self.schedule
+        )
+
+
+PAPER_STAGES = (Stage("depth", 230), Stage("normal", 460), Stage("refine", 5))
+
+
+@dataclass(frozen=True)
+class Config:
+    """A whole run; the default is the paper."""
+
+    network: Network = field(default_factory=Network)
+    losses: Losses = field(default_factory=Losses)
+    training: Training = field(default_factory=Training)
+    stages: tuple[Stage, ...] = PAPER_STAGES
+
+    def __post_init__(self) -> None:
+        shared = self.network.kind == "compact"
+        split = [s.name for s in self.stages if s.name in ("depth", "normal")]
+        _require(len(self.stages) > 0, "stages", "at least one", "none")
+        _require(not (shared and split), "stages", "joint or refine, as compact shares its backbone", split)
+        idle = self.network.refine_iterations == 0 and any(s.name == "refine" for s in self.stages)
+        _require(not idle, "stages", "no refine stage without refine_iterations", "refine")
+
+
+Part = TypeVar("Part", Network, Losses, Training, Stage)
+
+
+def _changed(part: Part, table: Any, where: str) -> Part:
+    """Apply a TOML table to a dataclass; the types of the defaults decide."""
+    if not isinstance(table, Mapping):
+        raise ConfigError(f"{where}: expected a table, got {table!r}")
+    known = {f.name for f in fields(part)}
+    unknown = table.keys() - known
+    if unknown:
+        raise ConfigError(
+            f"{where}: unknown key {', '.join(sorted(unknown))}", hint=f"known: {', '.join(sorted(known))}"
+        )
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        default = getattr(part, key)
+        value = tuple(value) if isinstance(value, list) else value
+        value = float(value) if isinstance(default, float) and type(value) is int else value
+        if type(value) is not type(default):
+            raise ConfigError(f"{where}.{key}: expected {type(default).__name__}, got {value!r}")
+        values[key] = value
+    return replace(part, **values)
+
+
+def config_from_dict(table: Mapping[str, Any], where: str = "config") -> Config:
+    """Read a configuration from plain TOML types: differences from the preset it names, or from the paper.
+
+    Raises
+    ------
+    ConfigError
+        Unknown keys, wrong types, values that contradict each other.
+    """
+    known = {"preset", "network", "losses", "training", "stage"}
+    if table.keys() - known:
+        unknown = ", ".join(sorted(table.keys() - known))
+        raise ConfigError(f"{where}: unknown key {unknown}", hint=f"known: {', '.join(sorted(known))}")
+    base = preset(str(table["preset"])) if "preset" in table else Config()
+    stages = base.stages
+    if "stage" in table:
+        for i, stage in enumerate(table["stage"]):
+            if not isinstance(stage, Mapping) or "name" not in stage or "epochs" not in stage:
+                raise ConfigError(f"{where}: stage {i}: expected name and epochs, got {stage!r}")
+        stages = tuple(
+            _changed(Stage("joint", 1), s, f"{where}: stage {i}") for i, s in enumerate(table["stage"])
+        )
+    parts = {
+        name: _changed(getattr(base, name), table.get(name, {}), f"{where}: {name}")
+        for name in ("network", "losses", "training")
+    }
+    return Config(**parts, stages=stages)
+
+
+def config_to_dict(config: Config) -> dict[str, Any]:
+    """Write the resolved configuration as plain TOML types; the inverse of :func:`config_from_dict`."""
+    table = asdict(config)
+    table["stage"] = list(table.pop("stages"))
+    return {k: _plain(v) for k, v in table.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, tuple | list) else value
+
+
+def dumps_config(config: Config) -> str:
+    """Write the resolved configuration as TOML."""
+    import tomli_w
+
+    return str(tomli_w.dumps(config_to_dict(config)))
+
+
+def loads_config(text: str, where: str = "config") -> Config:
+    """Read the text of a configuration."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as err:
+        raise ConfigError(f"{where}: not TOML: {err}") from err
+    return config_from_dict(table, where)
+
+
+def load_config(path: Path) -> Config:
+    """Read a configuration file."""
+    try:
+        return loads_config(Path(path).read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as err:
+        raise ConfigError(f"{path}: cannot read the configuration: {err}") from err
+
+
+def presets() -> tuple[str, ...]:
+    """Names of the shipped presets."""
+    folder = files("tofcapture_model") / "presets"
+    return tuple(sorted(p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml")))
+
+
+def preset(name: str) -> Config:
+    """Load a shipped preset: ``paper``, ``compact`` or ``demo``."""
+    if name not in presets():
+        raise ConfigError(f"expected a preset of {', '.join(presets())}, got {name!r}")
+    text = (files("tofcapture_model") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
+    return loads_config(text, f"preset {name}")

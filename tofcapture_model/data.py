@@ -1,0 +1,266 @@
+"""Samples of a dataset: one frame of one view, with its ground truth at twice the resolution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from tofcapture.camera import Camera
+from tofcapture.errors import DataError
+from tofcapture.files.layout import MaskBit
+from tofcapture.files.manifest import load_manifest
+from tofcapture.files.shard import ShardReader
+from tofcapture.frames import TofInfo
+from tofcapture.ops.phase import Decoded, ambiguity, decode, frequencies, phasors
+from tofcapture_model.frame import Frame, Target
+
+Float32 = NDArray[np.float32]
+MAX_RANGE = 5.0  # m; a decoded depth beyond it is an unwrapping failure on this rig and counts as a hole
+
+
+@dataclass(frozen=True)
+class SampleId:
+    """Which frame: scene name, view, frame."""
+
+    scene: str
+    view: int
+    frame: int
+
+
+def fill_nearest(image: Float32, valid: NDArray[np.bool_]) -> Float32:
+    """Give every pixel outside ``valid`` the value of the nearest pixel inside; 1 m where nothing is valid at all."""
+    from scipy.ndimage import distance_transform_edt
+
+    if not valid.any():
+        return np.ones_like(image)
+    if valid.all():
+        return image
+    rows, cols = distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    out: Float32 = image[rows, cols]
+    return out
+
+
+def _decode_frame(
+    raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float
+) -> tuple[NDArray[np.complex128], Decoded]:
+    phasor = phasors(raw, info.modulation_hz, info.phase_rad)
+    saturated: NDArray[np.bool_] = np.asarray((raw >= info.saturation).any(axis=0))
+    decoded = decode(
+        phasor, info.modulation_hz, camera, info.illuminator, info.range_errors, celsius, saturated=saturated
+    )
+    return phasor, decoded
+
+
+def make_frame(raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float = float("nan")) -> Frame:
+    """Decode one raw frame into what a network reads, as tensors without a batch axis.
+
+    Parameters
+    ----------
+    raw
+        (8, H, W) as the sensor gave it, or the mean of some frames.
+    info
+        Channel order, saturation, light source, range errors.
+    camera
+        Intrinsics of the ToF camera.
+    celsius
+        Sensor temperature; NaN: unknown.
+    """
+    phasor, decoded = _decode_frame(raw, info, camera, celsius)
+    depth = camera.radial_to_depth(decoded.radial).astype(np.float32)
+    valid = np.isfinite(depth) & (depth > 0.05) & (depth < MAX_RANGE)
+    low = ambiguity(frequencies(info.modulation_hz)[0])
+    gap = np.mod(decoded.range_low - decoded.range_high + low / 2, low) - low / 2
+    iq = np.stack([part for z in phasor for part in (z.real, z.imag)])
+    return Frame(
+        raw=_tensor(raw / info.saturation),
+        phasor=_tensor(iq / info.saturation),
+        depth=_tensor(fill_nearest(depth, valid)[None]),
+        valid=_tensor(valid[None]),
+        confidence=_tensor(decoded.confidence[None] / info.saturation),
+        gap=_tensor(gap[None]),
+        intrinsics=torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy]),
+    )
+
+
+def _tensor(array: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+
+
+def make_target(depth: Float32, normals: Float32, mask: NDArray[np.uint8]) -> Target:
+    """Turn ground truth (2H, 2W), (2H, 2W, 3), (2H, 2W) into tensors; what is missing becomes finite and is masked."""
+    hit = np.isfinite(depth) & np.isfinite(normals).all(-1)
+    good, context = (mask == 0) & hit, (mask == MaskBit.OUTSIDE) & hit
+    return Target(
+        depth=_tensor(np.where(hit, depth, 1.0)[None]),
+        normals=_tensor(np.where(hit[..., None], normals, [0.0, 0.0, -1.0]).transpose(2, 0, 1)),
+        good=torch.from_numpy(good[None]),
+        context=torch.from_numpy(context[None]),
+    )
+
+
+def crop(frame: Frame, target: Target, top: int, left: int, size: tuple[int, int]) -> tuple[Frame, Target]:
+    """Cut a window out of a frame and its target; the principal point moves with it."""
+    rows, cols = slice(top, top + size[0]), slice(left, left + size[1])
+    rows2, cols2 = slice(2 * top, 2 * (top + size[0])), slice(2 * left, 2 * (left + size[1]))
+    maps = {k: v[..., rows, cols] for k, v in frame._asdict().items() if k != "intrinsics"}
+    shift = torch.tensor([0.0, 0.0, float(left), float(top)])
+    return Frame(**maps, intrinsics=frame.intrinsics - shift), Target(*(x[..., rows2, cols2] for x in target))
+
+
+def mirror(frame: Frame, target: Target) -> tuple[Frame, Target]:
+    """Flip left and right: the images, the principal point, and the x of the normals."""
+    maps = {k: v.flip(-1) for k, v in frame._asdict().items() if k != "intrinsics"}
+    fx, fy, cx, cy = frame.intrinsics
+    flipped = Target(*(x.flip(-1) for x in target))
+    intrinsics = torch.stack([fx, fy, frame.depth.shape[-1] - 1 - cx, cy])
+    return Frame(**maps, intrinsics=intrinsics), flipped._replace(
+        normals=flipped.normals * torch.tensor([-1.0, 1.0, 1.0])[:, None, None]
+    )
+
+
+class FrameDataset(Dataset[tuple[Frame, Target]]):
+    """All frames of a split of a dataset.
+
+    An item is asked for by ``(epoch, i)``: crop and flip are drawn from ``(seed, epoch, i)``, so that an interrupted run goes
+    on with the very same samples, whatever the number of workers.
+
+    Parameters
+    ----------
+    folder
+        The dataset.
+    split
+        ``train``, ``val`` or ``test``.
+    size
+        (height, width) of crops at sensor resolution; () gives whole frames.
+    flip
+        Mirror half of the items.
+    seed
+        Of crops and flips.
+    frames
+        Use only the first so many frames of every view; 0: all.
+    cache_bytes
+        Decoded frames are kept in memory up to this size.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        split: str,
+        size: Sequence[int] = (),
+        *,
+        flip: bool = False,
+        seed: int = 0,
+        frames: int = 0,
+        cache_bytes: float = 1.5e9,
+    ) -> None:
+        entries = load_manifest(folder).split(split)
+        self.readers = {name: ShardReader(Path(folder) / entry.path) for name, entry in entries.items()}
+        self.size, self.flip, self.seed, self.cache_bytes = tuple(size), flip, seed, cache_bytes
+        self.samples = [
+            SampleId(name, view, frame)
+            for name, reader in self.readers.items()
+            for view in range(reader.views)
+            for frame in range(min(frames or reader.frames, reader.frames))
+        ]
+        if not self.samples:
+            raise DataError(
+                f"{folder}: the split {split} is empty", hint="record more scenes, or choose another --split"
+            )
+        self._frames: dict[SampleId, Frame] = {}
+        self._targets: dict[tuple[str, int], Target] = {}
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, key: tuple[int, int]) -> tuple[Frame, Target]:
+        epoch, i = key
+        sample = self.samples[i]
+        frame, target = self.frame(sample), self.target(sample)
+        rng = np.random.default_rng([self.seed, epoch, i])
+        if self.size:
+            frame, target = self._cropped(frame, target, rng)
+        if self.flip and rng.random() < 0.5:
+            frame, target = mirror(frame, target)
+        return frame, target
+
+    def frame(self, sample: SampleId) -> Frame:
+        """Decoded frame, whole."""
+        if sample in self._frames:
+            return self._frames[sample]
+        reader = self.readers[sample.scene]
+        celsius = reader.celsius(sample.view, sample.frame)
+        frame = make_frame(reader.raw(sample.view, sample.frame), reader.info, reader.camera, celsius)
+        if (len(self._frames) + 1) * sum(x.nbytes for x in frame) < self.cache_bytes:
+            self._frames[sample] = frame
+        return frame
+
+    def target(self, sample: SampleId) -> Target:
+        """Ground truth of a frame's view, whole."""
+        key = (sample.scene, sample.view)
+        if key in self._targets:
+            return self._targets[key]
+        gt = self.readers[sample.scene].ground_truth(sample.view, 2)
+        target = make_target(gt.depth, gt.normals, gt.mask)
+        if (len(self._targets) + 1) * sum(x.nbytes for x in target) < self.cache_bytes:
+            self._targets[key] = target
+        return target
+
+    def _cropped(self, frame: Frame, target: Target, rng: np.random.Generator) -> tuple[Frame, Target]:
+        """Crop about a pixel of good ground truth, because most of an image is background."""
+        h, w = frame.depth.shape[-2:]
+        size = (min(self.size[0], h), min(self.size[1], w))
+        good = target.good[0, ::8, ::8].nonzero()
+        at = np.array([rng.integers(h), rng.integers(w)])
+        if len(good):
+            at = good[int(rng.integers(len(good)))].numpy() * 4 + rng.integers(-16, 17, 2)
+        top, left = (int(np.clip(a - s // 2, 0, n - s)) for a, s, n in zip(at, size, (h, w), strict=True))
+        return crop(frame, target, top, left, size)
+
+    def close(self) -> None:
+        """Close the shards."""
+        for reader in self.readers.values():
+            reader.close()
+
+
+def collate(items: Sequence[tuple[Frame, Target]]) -> tuple[Frame, Target]:
+    """Stack items along a new first axis; images in channels-last memory order."""
+    frames, targets = zip(*items, strict=True)
+    frame = Frame(*(torch.stack(x) for x in zip(*frames, strict=True)))
+    maps = {
+        k: v.contiguous(memory_format=torch.channels_last)
+        for k, v in frame._asdict().items()
+        if k != "intrinsics"
+    }
+    return Frame(**maps, intrinsics=frame.intrinsics), Target(
+        *(torch.stack(x) for x in zip(*targets, strict=True))
+    )
+
+
+def batched(frame: Frame) -> Frame:
+    """Give a single frame its batch axis."""
+    return Frame(*(x[None] for x in frame))
+
+
+def epoch_batches(
+    count: int, batch: int, seed: int, epoch: int, rank: int = 0, world: int = 1
+) -> list[list[tuple[int, int]]]:
+    """Keys ``(epoch, i)`` of every batch of an epoch, for one of ``world`` processes.
+
+    The order is a permutation drawn from ``(seed, epoch)``; all processes get equally many full batches, so that they step
+    together. Fewer samples than one step needs are repeated.
+    """
+    order = np.random.default_rng([seed, epoch]).permutation(count)
+    step = batch * world
+    order = np.resize(order, max(step, count - count % step))
+    return [
+        [(epoch, int(i)) for i in order[s + rank * batch : s + (rank + 1) * batch]]
+        for s in range(0, len(order), step)
+    ]

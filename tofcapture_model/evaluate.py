@@ -1,0 +1,150 @@
+"""Measure the sensor and a model against ground truth; writes ``results.json``."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tofcapture_model.baselines import sensor
+from tofcapture_model.checkpoint import find_model, load_model
+from tofcapture_model.data import FrameDataset, batched
+from tofcapture_model.frame import Frame, frame_to, target_to
+from tofcapture_model.joint import JointModel
+from tofcapture_model.metrics import Score
+
+FORMAT, VERSION = "tofcapture-results", 1
+
+Method = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
+"""Depth (B, 1, 2H, 2W), normals (B, 3, 2H, 2W), and where the method answers by itself."""
+
+
+def model_method(model: JointModel) -> Method:
+    """Wrap a model as a method; it answers everywhere."""
+
+    def answer(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        estimate = model(frame)
+        return estimate.depth, estimate.normals, torch.isfinite(estimate.depth)
+
+    return answer
+
+
+@torch.no_grad()
+def score(
+    methods: dict[str, Method],
+    dataset: FrameDataset,
+    device: torch.device,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[dict[str, Score], int]:
+    """Run methods over all frames of a dataset.
+
+    Returns
+    -------
+    scores by method, and how many frames were left out because no pixel of their ground truth is good
+    """
+    scores = {name: Score() for name in methods}
+    empty = 0
+    for i, sample in enumerate(dataset.samples):
+        frame = frame_to(batched(dataset.frame(sample)), device)
+        target = target_to(dataset.target(sample), device)
+        empty += int(not target.good.any())
+        for name, method in methods.items():
+            depth, normals, measured = method(frame)
+            scores[name].add(
+                depth, normals, target.depth[None], target.normals[None], target.good[None], measured
+            )
+        if progress:
+            progress(i + 1, len(dataset.samples))
+    return scores, empty
+
+
+def evaluate(
+    dataset: Path,
+    weights: Path | None,
+    out: Path,
+    *,
+    split: str = "test",
+    frames: int = 1,
+    device: str = "cpu",
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Evaluate the sensor's own single frame and a model on a split, at twice the sensor's resolution, over mask == 0.
+
+    Parameters
+    ----------
+    dataset
+        Folder with ``manifest.json``.
+    weights
+        Checkpoint; ``None``: the bundled one.
+    out
+        ``results.json``, written atomically.
+    split
+        ``train``, ``val`` or ``test``.
+    frames
+        Frames of every view that are evaluated; 0: all.
+    device
+        Torch device.
+    progress
+        Called with (done, all).
+
+    Returns
+    -------
+    What was written; lengths in metres.
+    """
+    model, config, provenance = load_model(weights)
+    model.to(device)
+    data = FrameDataset(dataset, split, frames=frames, cache_bytes=0)
+    methods: dict[str, Method] = {"sensor": sensor.estimate, "model": model_method(model)}
+    scores, empty = score(methods, data, torch.device(device), progress)
+    reader = next(iter(data.readers.values()))
+    results = {
+        "format": FORMAT,
+        "version": VERSION,
+        "dataset": str(dataset),
+        "split": split,
+        "scenes": sorted(data.readers),
+        "views": len({(s.scene, s.view) for s in data.samples}),
+        "frames": len(data.samples),
+        "frames_without_ground_truth": empty,
+        "resolution": [2 * reader.camera.height, 2 * reader.camera.width],
+        "units": "m",
+        "weights": str(find_model(weights)),
+        "network": config.network.kind,
+        "training": provenance,
+        "methods": {name: s.table() for name, s in scores.items()},
+    }
+    data.close()
+    _write(Path(out), results)
+    return results
+
+
+def _write(path: Path, results: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("w", encoding="utf-8") as file:
+        json.dump(results, file, indent=1, allow_nan=False)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def comparison(results: dict[str, Any]) -> str:
+    """Table of the main columns for people, millimetres and degrees."""
+    rows = [
+        f"{'method':8} {'MAE mm':>8} {'median':>8} {'RMSE':>8} {'ABS %':>7} {'normal deg':>11} {'>20 deg %':>10} {'coverage':>9}"
+    ]
+    for name, table in results["methods"].items():
+        d, n = table["depth"]["pixel"], table["normal"]["pixel"]
+        if not d["pixels"]:
+            rows.append(f"{name:8} no pixel with good ground truth")
+            continue
+        rows.append(
+            f"{name:8} {1000 * d['mae']:8.2f} {1000 * d['median']:8.2f} {1000 * d['rmse']:8.2f} {100 * d['abs']:7.2f}"
+            f" {n['mean_deg']:11.2f} {n['paper_bad20_pct']:10.2f} {100 * d['coverage']:8.1f}%"
+        )
+    return "\n".join(rows)

@@ -1,0 +1,89 @@
+"""What a network reads and what it is held against: batches of frames and of targets."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Frame(NamedTuple):
+    """One ToF frame per batch item, float32.
+
+    Attributes
+    ----------
+    raw
+        (B, 8, H, W) raw channels in units of the sensor's saturation value.
+    phasor
+        (B, 4, H, W) I and Q of the low, then of the high frequency, in the same unit.
+    depth
+        (B, 1, H, W) decoded depth (z), metres; holes carry their nearest measured neighbour.
+    valid
+        (B, 1, H, W) 1 where ``depth`` was measured, 0 where it was filled.
+    confidence
+        (B, 1, H, W) amplitude of the high frequency in units of the saturation value.
+    gap
+        (B, 1, H, W) range of the low minus range of the high frequency, metres: the multipath cue.
+    intrinsics
+        (B, 4) fx, fy, cx, cy in pixels of the (H, W) grid.
+    """
+
+    raw: Tensor
+    phasor: Tensor
+    depth: Tensor
+    valid: Tensor
+    confidence: Tensor
+    gap: Tensor
+    intrinsics: Tensor
+
+
+class Target(NamedTuple):
+    """Ground truth at twice the resolution.
+
+    Attributes
+    ----------
+    depth
+        (B, 1, 2H, 2W) float32 metres; finite everywhere, meaningless where ``hit`` is False.
+    normals
+        (B, 3, 2H, 2W) float32, unit, facing the camera.
+    good
+        (B, 1, 2H, 2W) bool: no mask bit is set; what metrics are taken over.
+    context
+        (B, 1, 2H, 2W) bool: measured surface outside the object crop; extra supervision, never evaluated.
+    """
+
+    depth: Tensor
+    normals: Tensor
+    good: Tensor
+    context: Tensor
+
+
+class Estimate(NamedTuple):
+    """What a model answers, float32 at twice the resolution.
+
+    Attributes
+    ----------
+    depth, normals
+        (B, 1, 2H, 2W) metres and (B, 3, 2H, 2W) unit camera-facing, after refinement.
+    error
+        (B, 1, 2H, 2W) expected absolute error of the depth, metres, positive.
+    initial_depth, initial_normals
+        The same before refinement.
+    """
+
+    depth: Tensor
+    normals: Tensor
+    error: Tensor
+    initial_depth: Tensor
+    initial_normals: Tensor
+
+
+def frame_to(frame: Frame, device: torch.device) -> Frame:
+    """Move a frame to a device."""
+    return Frame(*(x.to(device) for x in frame))
+
+
+def target_to(target: Target, device: torch.device) -> Target:
+    """Move a target to a device."""
+    return Target(*(x.to(device) for x in target))

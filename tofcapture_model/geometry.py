@@ -1,0 +1,220 @@
+"""Depth, rays and normals on the image grid, differentiable.
+
+Depth is z in metres, normals are unit and face the camera (``n . p < 0``), images are (B, C, H, W), pixel centres integers.
+All functions keep the dtype they are given; the project calls them in float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812
+
+_TINY = 1e-12
+
+
+def scale_intrinsics(intrinsics: Tensor, s: int) -> Tensor:
+    """Intrinsics (B, 4) of the same view at ``s`` times the resolution: ``f' = s f``, ``c' = s (c + 0.5) - 0.5``."""
+    f, c = intrinsics[:, :2], intrinsics[:, 2:]
+    return torch.cat([f * s, (c + 0.5) * s - 0.5], dim=1)
+
+
+def rays(intrinsics: Tensor, height: int, width: int) -> Tensor:
+    """(B, 3, H, W) rays through the pixel centres with z = 1, from intrinsics (B, 4) fx, fy, cx, cy."""
+    fx, fy, cx, cy = (intrinsics[:, i, None, None] for i in range(4))
+    v, u = torch.meshgrid(
+        torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device),
+        torch.arange(width, dtype=intrinsics.dtype, device=intrinsics.device),
+        indexing="ij",
+    )
+    x, y = (u - cx) / fx, (v - cy) / fy
+    return torch.stack([x, y, torch.ones_like(x)], dim=1)
+
+
+def unproject(depth: Tensor, intrinsics: Tensor) -> Tensor:
+    """Points (B, 3, H, W) of depth (B, 1, H, W), metres."""
+    return depth * rays(intrinsics, *depth.shape[-2:])
+
+
+def unit(vectors: Tensor) -> Tensor:
+    """Normalise (B, 3, H, W) along the channels; the gradient at zero length is finite."""
+    return vectors / vectors.square().sum(1, keepdim=True).clamp_min(_TINY).sqrt()
+
+
+def shifted(image: Tensor, dy: int, dx: int) -> Tensor:
+    """``out[v, u] = image[v + dy, u + dx]``; beyond the border the border is repeated."""
+    h, w = image.shape[-2:]
+    padded = F.pad(image, (max(-dx, 0), max(dx, 0), max(-dy, 0), max(dy, 0)), mode="replicate")
+    return padded[..., max(dy, 0) : max(dy, 0) + h, max(dx, 0) : max(dx, 0) + w]
+
+
+def offsets(radius: int, step: int = 1) -> Iterator[tuple[int, int]]:
+    """Yield the (dy, dx) of a square window without its centre."""
+    reach = range(-radius * step, radius * step + 1, step)
+    return ((dy, dx) for dy in reach for dx in reach if (dy, dx) != (0, 0))
+
+
+@lru_cache(maxsize=16)
+def _moment_filters(radius: int) -> Tensor:
+    """(6, 1, k, k) weights 1, u, v, uu, uv, vv of a window."""
+    r = torch.arange(-radius, radius + 1, dtype=torch.float64)
+    v, u = torch.meshgrid(r, r, indexing="ij")
+    return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v])[:, None]
+
+
+def local_planes(depth: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """Fit inverse depth linearly in every window (method: ``n . r = 1 / z``, a plane is linear in inverse depth).
+
+    Parameters
+    ----------
+    depth
+        (B, 1, H, W) metres, positive and finite everywhere.
+    valid
+        (B, 1, H, W) weight of every pixel, 0 for holes.
+    radius
+        Window of ``2 radius + 1`` pixels.
+
+    Returns
+    -------
+    coefficients
+        (B, 3, H, W): inverse depth at the window's centre, its slope per pixel in u and in v; 1/m.
+    variance
+        (B, 1, H, W) weighted mean square residual of the fit, 1/m^2.
+    """
+    inverse = 1 / depth
+    origin = inverse.mean(dim=(2, 3), keepdim=True)  # float32 moments cancel badly far from zero
+    i = (inverse - origin) * valid
+    bank = _moment_filters(radius).to(depth)
+    s1, su, sv, suu, suv, svv = F.conv2d(valid, bank, padding=radius).unbind(1)
+    t1, tu, tv = F.conv2d(i, bank[:3], padding=radius).unbind(1)
+    tt = F.conv2d(i * (inverse - origin), bank[:1], padding=radius)[:, 0]
+    ridge = 1e-6 * suu + _TINY  # a window with one row or column of pixels has a slope of zero across it
+    n = s1.clamp_min(_TINY)
+    mu, mv, mi = su / n, sv / n, t1 / n
+    cuu, cvv, cuv = suu - su * mu + ridge, svv - sv * mv + ridge, suv - su * mv
+    cui, cvi = tu - t1 * mu, tv - t1 * mv
+    det = (cuu * cvv - cuv * cuv).clamp_min(_TINY)
+    a, b = (cvv * cui - cuv * cvi) / det, (cuu * cvi - cuv * cui) / det
+    variance = ((tt - t1 * mi - a * cui - b * cvi) / n).clamp_min(0)
+    centre = mi - a * mu - b * mv + origin[:, 0]
+    return torch.stack([centre, a, b], dim=1), variance[:, None]
+
+
+def plane_normals(coefficients: Tensor, intrinsics: Tensor) -> Tensor:
+    """Turn :func:`local_planes` into unit camera-facing normals (B, 3, H, W)."""
+    centre, a, b = coefficients.unbind(1)
+    fx, fy = intrinsics[:, 0, None, None], intrinsics[:, 1, None, None]
+    x, y, _ = rays(intrinsics, *centre.shape[-2:]).unbind(1)
+    outward = torch.stack([a * fx, b * fy, centre - a * fx * x - b * fy * y], dim=1)  # n . r = 1/z > 0
+    return -unit(outward)
+
+
+def depth_to_normals(depth: Tensor, valid: Tensor, intrinsics: Tensor, radius: int = 4) -> Tensor:
+    """Normals of a depth map by least squares on inverse depth.
+
+    Parameters
+    ----------
+    depth, valid
+        (B, 1, H, W) metres, and weight of every pixel.
+    intrinsics
+        (B, 4).
+    radius
+        4 is the 9 x 9 window of GeoNet.
+
+    Returns
+    -------
+    (B, 3, H, W) unit, camera-facing
+    """
+    coefficients, _ = local_planes(depth, valid, radius)
+    return plane_normals(coefficients, intrinsics)
+
+
+def side_window_planes(
+    depth: Tensor, valid: Tensor, radius: int, floor: float = 2e-3
+) -> tuple[Tensor, Tensor]:
+    """Fit planes that do not reach across edges.
+
+    Each pixel is explained by nine windows: the one centred on it and the eight that touch it with a side or a corner;
+    those that fit badly (they hold an edge) count little. It is side-window filtering with planes instead of means.
+
+    Parameters
+    ----------
+    depth, valid
+        As in :func:`local_planes`.
+    radius
+        Of each window.
+    floor
+        Standard deviation, 1/m, below which residuals are equal.
+
+    Returns
+    -------
+    coefficients
+        (B, 3, H, W) as in :func:`local_planes`, at the pixel itself.
+    variance
+        (B, 1, H, W) of the best window.
+    """
+    planes, variance = local_planes(depth, valid, radius)
+    weight = (variance + floor**2) ** -3
+    weight = weight / weight.amax(dim=(2, 3), keepdim=True)
+    packed = torch.cat([planes, variance, weight], dim=1)
+    total = torch.zeros_like(planes)
+    norm = torch.full_like(weight, 1e-30)
+    best = torch.full_like(variance, torch.inf)
+    for dy, dx in ((y, x) for y in (-radius, 0, radius) for x in (-radius, 0, radius)):
+        c, a, b, var, w = shifted(packed, dy, dx).chunk(5, dim=1)
+        total = total + w * torch.cat([c - a * dx - b * dy, a, b], dim=1)
+        norm, best = norm + w, torch.minimum(best, var)
+    return total / norm, best
+
+
+def propagate_depth(
+    depth: Tensor,
+    normals: Tensor,
+    intrinsics: Tensor,
+    confidence: Tensor,
+    radius: int = 2,
+    step: int = 1,
+    alpha: float = 0.95,
+    max_jump: float = 0.02,
+) -> Tensor:
+    """Move every depth towards the tangent planes of its neighbours (GeoNet's normal-to-depth kernel regression).
+
+    The neighbour j votes ``z_ji = z_j (n_j . r_j) / (n_j . r_i)`` for pixel i with weight ``n_j . n_i`` where that is above
+    ``alpha``; the sign of the normals cancels. Votes further than ``max_jump`` from the present depth are dropped.
+
+    Parameters
+    ----------
+    depth, normals, confidence
+        (B, 1, H, W) metres, (B, 3, H, W) unit, (B, 1, H, W) positive weight of each pixel as a voter.
+    intrinsics
+        (B, 4).
+    radius, step
+        Window in taps to each side, and pixels between taps.
+    alpha
+        Cosine of the largest angle between normals that vote for each other.
+    max_jump
+        Metres.
+
+    Returns
+    -------
+    (B, 1, H, W) metres
+    """
+    r = rays(intrinsics, *depth.shape[-2:])
+    plane = (normals * r).sum(1, keepdim=True) * depth  # n . p, the plane's distance
+    packed = torch.cat([normals, plane, confidence], dim=1)
+    total, norm = depth * confidence, confidence
+    for dy, dx in offsets(radius, step):
+        other = shifted(packed, dy, dx)
+        n, distance, trust = other[:, :3], other[:, 3:4], other[:, 4:]
+        cosine = (n * normals).sum(1, keepdim=True)
+        slope = (n * r).sum(1, keepdim=True)
+        steep = slope.abs() < 1e-2
+        vote = distance / torch.where(steep, torch.ones_like(slope), slope)
+        keep = (cosine > alpha) & ~steep & ((vote - depth).abs() < max_jump)
+        weight = torch.where(keep, cosine * trust, torch.zeros_like(trust))
+        total = total + weight * torch.where(keep, vote, torch.zeros_like(vote))
+        norm = norm + weight
+    return total / norm

@@ -1,0 +1,92 @@
+"""The whole model: ToF raw data in, depth, error map and normals at twice the resolution out."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+from torch.nn import functional as F  # noqa: N812
+
+from tofcapture_model.config import Config, Network
+from tofcapture_model.frame import Estimate, Frame
+from tofcapture_model.geometry import scale_intrinsics
+from tofcapture_model.networks import CompactInputs, ErrorMap, PaperInputs, Raw2Depth, Raw2Normal
+from tofcapture_model.refine import Refinement
+from tofcapture_model.unet import UNet
+
+PARTS = {
+    "depth": ("raw2depth", "error_map"),
+    "normal": ("raw2normal",),
+    "refine": ("refinement",),
+    "joint": ("backbone", "raw2depth", "error_map", "raw2normal", "refinement"),
+}
+
+
+class JointModel(nn.Module):
+    """Joint depth and normal estimation (paper section IV).
+
+    Parameters
+    ----------
+    network
+        Which network; the same class holds the paper's three U-Nets and the compact one.
+    """
+
+    def __init__(self, network: Network) -> None:
+        super().__init__()
+        compact = network.kind == "compact"
+        self.inputs = CompactInputs(network.windows) if compact else PaperInputs(network.inputs)
+        channels = network.width if compact else self.inputs.channels
+        self.backbone = (
+            UNet(self.inputs.channels, network.width, network.width, network.levels)
+            if compact
+            else nn.Identity()
+        )
+        self.raw2depth = Raw2Depth(network, channels)
+        self.error_map = ErrorMap(network, channels)
+        self.raw2normal = Raw2Normal(network, channels)
+        self.refinement = Refinement(network.refine_iterations, network.refine_radius)
+
+    def forward(self, frame: Frame, stage: str = "joint") -> Estimate:
+        """Estimate depth, error map and normals.
+
+        Parameters
+        ----------
+        frame
+            (B, ., H, W), any H and W.
+        stage
+            A training stage; ``depth`` and ``normal`` skip the networks that do not take part in it.
+
+        Returns
+        -------
+        Estimate, at (2H, 2W)
+        """
+        features = self.inputs(frame)
+        shared = self.backbone(features.image)
+        if stage == "normal":
+            depth = F.interpolate(frame.depth, scale_factor=2, mode="bilinear", align_corners=False)
+        else:
+            depth = self.raw2depth(shared, features, frame)
+        error = self.error_map(shared, depth, frame)
+        if stage == "depth":
+            normals = F.interpolate(features.normals, scale_factor=2, mode="bilinear", align_corners=False)
+        else:
+            normals = self.raw2normal(shared, features)
+        if stage in ("depth", "normal"):
+            return Estimate(depth, normals, error, depth, normals)
+        fine_depth, fine_normals = self.refinement(
+            depth, normals, error, scale_intrinsics(frame.intrinsics, 2)
+        )
+        return Estimate(fine_depth, fine_normals, error, depth, normals)
+
+
+def build_model(config: Config) -> JointModel:
+    """Build the model of a configuration, in channels-last memory order (a third faster on CPU)."""
+    return JointModel(config.network).to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
+
+
+def select_stage(model: JointModel, stage: str) -> list[nn.Parameter]:
+    """Freeze all parameters but those that learn in ``stage``; return these."""
+    learning = []
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(name.split(".")[0] in PARTS[stage])
+        learning += [parameter] if parameter.requires_grad else []
+    return learning

@@ -1,0 +1,157 @@
+"""The three networks of the paper, and their compact siblings: inputs and heads.
+
+Every head answers at twice the resolution and starts as the identity: depth as the decoded ToF depth, normals as the
+classical ones, so that an untrained model is the sensor and training can only be judged by what it adds.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812
+
+from tofcapture_model.config import SOURCES, Network
+from tofcapture_model.frame import Frame
+from tofcapture_model.geometry import plane_normals, rays, side_window_planes, unit
+from tofcapture_model.unet import CONVEX_CHANNELS, UNet, bilinear_logits, convex_upsample
+
+RESIDUAL_UNIT = 0.01  # m; a head's output of 1 moves the depth by a centimetre
+_PHASOR_FLOOR = 1e-4  # of saturation; below it an amplitude is noise
+
+
+class Features(NamedTuple):
+    """What the heads read.
+
+    Attributes
+    ----------
+    image
+        (B, C, H, W) for the convolutions, about unit scale.
+    candidates
+        (B, K, H, W) classically denoised depths, metres; K may be 0.
+    normals
+        (B, 3, H, W) normals to start from; unit.
+    """
+
+    image: Tensor
+    candidates: Tensor
+    normals: Tensor
+
+
+class PaperInputs(nn.Module):
+    """Stack the paper's inputs: 8 raw channels, confidence, decoded depth; in that order, 10 channels in all."""
+
+    def __init__(self, sources: tuple[str, ...]) -> None:
+        super().__init__()
+        self.sources = sources
+        self.channels = sum(SOURCES[s] for s in sources)
+
+    def forward(self, frame: Frame) -> Features:
+        """Take the chosen sources of a frame as they are; normals start towards the camera."""
+        image = torch.cat([getattr(frame, s) for s in self.sources], dim=1)
+        towards = -unit(rays(frame.intrinsics, *frame.depth.shape[-2:]))
+        return Features(image, frame.depth[:, :0], towards)
+
+
+class CompactInputs(nn.Module):
+    """Turn a frame into what physics says matters: phasors, amplitudes, the frequencies' gap, plane fits at some scales."""
+
+    def __init__(self, windows: tuple[int, ...]) -> None:
+        super().__init__()
+        self.windows = windows
+        self.channels = 12 + 4 * len(windows)
+
+    @torch.no_grad()
+    def forward(self, frame: Frame) -> Features:
+        """Compute features; nothing here is learned."""
+        r = rays(frame.intrinsics, *frame.depth.shape[-2:])
+        planes = [side_window_planes(frame.depth, frame.valid + 1e-3, w) for w in self.windows]
+        smooth = [1 / c[:, :1].clamp_min(1e-2) for c, _ in planes]
+        normals = [plane_normals(c, frame.intrinsics) for c, _ in planes]
+        channels = [
+            *_phasor_channels(frame.phasor),
+            (frame.depth - 0.8) / 0.4,  # the rig works at 0.35 m to 1.5 m
+            (frame.gap * 10).clamp(-2, 2),  # 20 MHz is noisy by centimetres
+            frame.valid,
+            r[:, :2],
+            *((s - frame.depth).mul(50).clamp(-2, 2) for s in smooth),  # noise is some mm
+            *((var.sqrt() * 50).clamp(0, 2) for _, var in planes),
+            *((n[:, :2]) for n in normals),
+        ]
+        return Features(torch.cat(channels, 1), torch.cat(smooth, 1), normals[len(normals) // 2])
+
+
+def _phasor_channels(phasor: Tensor) -> list[Tensor]:
+    """Direction and log amplitude of each frequency, and the log of their ratio: 2 x 3 + 1 channels."""
+    out: list[Tensor] = []
+    logs = []
+    for z in phasor.chunk(2, dim=1):
+        amplitude = z.square().sum(1, keepdim=True).sqrt()
+        out.append(z / (amplitude + _PHASOR_FLOOR))
+        logs.append((amplitude + _PHASOR_FLOOR).log() / 3 + 1)
+    return [*out, *logs, (logs[1] - logs[0]) * 3]
+
+
+def _zeroed(inputs: int, outputs: int) -> nn.Conv2d:
+    conv = nn.Conv2d(inputs, outputs, 1)
+    nn.init.zeros_(conv.weight)
+    nn.init.zeros_(conv.bias) if conv.bias is not None else None
+    return conv
+
+
+def _head(network: Network, channels: int, outputs: int) -> nn.Module:
+    """Build a U-Net of its own for the paper, a 1 x 1 convolution on the shared backbone for compact."""
+    if network.kind == "paper":
+        return UNet(channels, outputs, network.width, network.levels, zero_last=True)
+    return _zeroed(channels, outputs)
+
+
+class Raw2Depth(nn.Module):
+    """Decoded depth + gated steps to its candidates + residual, then convex upsampling."""
+
+    def __init__(self, network: Network, channels: int) -> None:
+        super().__init__()
+        self.candidates = len(network.windows) if network.kind == "compact" else 0
+        self.max_residual = network.max_residual
+        self.net = _head(network, channels, self.candidates + 1 + CONVEX_CHANNELS)
+        self.register_buffer("bilinear", bilinear_logits().reshape(1, -1, 1, 1), persistent=False)
+        self.bilinear: Tensor
+
+    def forward(self, shared: Tensor, features: Features, frame: Frame) -> Tensor:
+        """Return depth (B, 1, 2H, 2W), metres."""
+        gates, residual, logits = self.net(shared).float().split([self.candidates, 1, CONVEX_CHANNELS], dim=1)
+        steps = (gates * (features.candidates - frame.depth)).sum(1, keepdim=True)
+        depth = frame.depth + steps + self._bounded(residual * RESIDUAL_UNIT)
+        return convex_upsample(depth.clamp_min(0.05), logits + self.bilinear)
+
+    def _bounded(self, residual: Tensor) -> Tensor:
+        limit = self.max_residual
+        return limit * torch.tanh(residual / limit) if limit else residual
+
+
+class ErrorMap(nn.Module):
+    """Expected absolute error of the depth. Reads the depth detached: the error must not shape the depth."""
+
+    def __init__(self, network: Network, channels: int) -> None:
+        super().__init__()
+        self.net = _head(network, channels + 4, 4)
+
+    def forward(self, shared: Tensor, depth: Tensor, frame: Frame) -> Tensor:
+        """Return (B, 1, 2H, 2W), metres, positive."""
+        change = F.pixel_unshuffle(depth.detach(), 2) - frame.depth
+        out = self.net(torch.cat([shared, (change * 20).clamp(-2, 2)], dim=1)).float()
+        return F.softplus(F.pixel_shuffle(out, 2)) * RESIDUAL_UNIT
+
+
+class Raw2Normal(nn.Module):
+    """Residual on the starting normals, by sub-pixel convolution."""
+
+    def __init__(self, network: Network, channels: int) -> None:
+        super().__init__()
+        self.net = _head(network, channels, 12)
+
+    def forward(self, shared: Tensor, features: Features) -> Tensor:
+        """Return unit camera-facing normals (B, 3, 2H, 2W)."""
+        start = F.interpolate(features.normals, scale_factor=2, mode="bilinear", align_corners=False)
+        return unit(start + F.pixel_shuffle(self.net(shared).float(), 2))

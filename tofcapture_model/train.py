@@ -1,0 +1,340 @@
+"""Train a model: one loop, no callbacks. ``torchrun`` makes it run on many processes; a killed run goes on bit by bit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from tofcapture.errors import ConfigError
+from tofcapture.files.manifest import load_manifest
+from tofcapture.files.seal import sha256_of
+from tofcapture_model.checkpoint import load_resume, load_strictly, save_model, save_resume
+from tofcapture_model.config import Config, Stage, dumps_config
+from tofcapture_model.data import FrameDataset, collate, epoch_batches
+from tofcapture_model.evaluate import model_method, score
+from tofcapture_model.frame import frame_to, target_to
+from tofcapture_model.geometry import scale_intrinsics
+from tofcapture_model.joint import JointModel, build_model, select_stage
+from tofcapture_model.losses import Objective, objective
+
+SAVE_EVERY = 60.0  # s between resume points
+LOG_EVERY = 20  # steps
+
+
+@dataclass
+class Position:
+    """Where a run is; everything in it goes into the resume point.
+
+    Attributes
+    ----------
+    stage, epoch, batch
+        The next batch to take.
+    step
+        Steps done, over all stages.
+    elapsed
+        Seconds of training in this stage, over all sittings.
+    """
+
+    stage: int = 0
+    epoch: int = 0
+    batch: int = 0
+    step: int = 0
+    elapsed: float = 0.0
+
+
+@dataclass(frozen=True)
+class Trained:
+    """Result of :func:`train`: the checkpoint, steps done, whether all stages are finished, the last losses."""
+
+    path: Path
+    steps: int
+    finished: bool
+    losses: dict[str, float]
+
+
+@contextmanager
+def _processes() -> Iterator[tuple[int, int]]:
+    """Join the group that ``torchrun`` announces in the environment; (rank, world)."""
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    if world == 1:
+        yield 0, 1
+        return
+    torch.distributed.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    try:
+        yield torch.distributed.get_rank(), world
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+def train(
+    config: Config,
+    dataset: Path,
+    out: Path,
+    *,
+    epochs: int | None = None,
+    minutes: float | None = None,
+    stop_after: int | None = None,
+    device: str = "cpu",
+    workers: int = 0,
+    report: Callable[[str, float, str], None] = lambda _what, _done, _text: None,
+) -> Trained:
+    """Train all stages of a configuration on the ``train`` split of a dataset.
+
+    Running it again in the same folder goes on where it stopped; on one device, and without ``minutes``, to the same bits.
+
+    Parameters
+    ----------
+    config
+        Network, losses, stages.
+    dataset
+        Folder with ``manifest.json``.
+    out
+        Folder of the run: ``model.safetensors``, ``model.toml``, ``resume.safetensors``, ``metrics.jsonl``, TensorBoard events.
+    epochs
+        Of every stage, instead of the configuration's.
+    minutes
+        Budget of the whole run; stages share it by their epochs, schedules follow the clock.
+    stop_after
+        Stop, resumable, after so many steps in all.
+    device
+        Torch device; under ``torchrun`` with CUDA each process takes its own.
+    workers
+        Processes that read data; 0 keeps decoded frames in memory, best for small datasets.
+    report
+        Called with (stage, fraction done, one line of text).
+
+    Returns
+    -------
+    Trained
+    """
+    if epochs is not None:
+        config = replace(config, stages=tuple(replace(s, epochs=epochs) for s in config.stages))
+    with _processes() as (rank, world):
+        place = torch.device(
+            f"cuda:{os.environ['LOCAL_RANK']}" if world > 1 and torch.cuda.is_available() else device
+        )
+        torch.manual_seed(config.training.seed)
+        model = build_model(config).to(place)
+        source = {"dataset": str(dataset), "manifest_sha256": sha256_of(Path(dataset) / "manifest.json")}
+        key = _key(config, source["manifest_sha256"], minutes)
+        position, moments = _resume(out, model, key)
+        if position.stage == len(config.stages):
+            return Trained(out / "model.safetensors", position.step, finished=True, losses={})
+        data = FrameDataset(
+            dataset,
+            "train",
+            config.training.crop,
+            flip=config.training.flip,
+            seed=config.training.seed,
+            cache_bytes=0 if workers else 1.5e9,
+        )
+        log = _Log(out if rank == 0 else None)
+        losses: dict[str, float] = {}
+        total_epochs = sum(s.epochs for s in config.stages)
+        for position.stage in range(position.stage, len(config.stages)):  # noqa: B020  the position is the loop's state
+            stage = config.stages[position.stage]
+            budget = None if minutes is None else 60 * minutes * stage.epochs / total_epochs
+            learning = select_stage(model, stage.name)
+            names = {id(p): n for n, p in model.named_parameters()}
+            optimizer = torch.optim.Adam(learning, lr=stage.learning_rate)
+            _restore(optimizer, names, moments)
+            wrapped = nn.parallel.DistributedDataParallel(model) if world > 1 else model
+            started, saved = time.monotonic() - position.elapsed, time.monotonic()
+            while not _done(position, stage, budget):
+                batches = epoch_batches(
+                    len(data), config.training.batch, config.training.seed, position.epoch, rank, world
+                )
+                loader = DataLoader(
+                    data, batch_sampler=batches[position.batch :], num_workers=workers, collate_fn=collate
+                )
+                for frame, target in loader:
+                    progress = _progress(position, stage, len(batches), budget)
+                    rate = _learning_rate(optimizer, stage, config.training.schedule, progress)
+                    frame, target = frame_to(frame, place), target_to(target, place)  # noqa: PLW2901
+                    estimate = wrapped(frame, stage.name)
+                    loss = objective(
+                        config.losses, stage.name, estimate, target, scale_intrinsics(frame.intrinsics, 2)
+                    )
+                    optimizer.zero_grad(set_to_none=True)
+                    loss.total.backward()  # type: ignore[no-untyped-call]
+                    nn.utils.clip_grad_norm_(learning, 1.0)
+                    optimizer.step()
+
+                    position.step, position.batch = position.step + 1, position.batch + 1
+                    position.elapsed = _elapsed(started, place, world)
+                    if position.step % LOG_EVERY == 1:
+                        losses = log.step(position, stage, loss, rate)
+                        report(stage.name, progress, f"step {position.step} loss {losses['total']:.3f}")
+                    stop = stop_after is not None and position.step >= stop_after
+                    if rank == 0 and (stop or time.monotonic() - saved > SAVE_EVERY):
+                        save_resume(
+                            out / "resume.safetensors", model, optimizer, names, _state(position, key)
+                        )
+                        saved = time.monotonic()
+                    if stop:
+                        return Trained(
+                            out / "resume.safetensors", position.step, finished=False, losses=losses
+                        )
+                    if budget is not None and position.elapsed >= budget:
+                        break
+                position.epoch, position.batch = position.epoch + 1, 0
+                every = config.training.validate_every
+                if rank == 0 and (_done(position, stage, budget) or (every and position.epoch % every == 0)):
+                    log.validation(position, stage, _validate(model, dataset, place))
+            position.epoch, position.elapsed, moments = 0, 0.0, {}
+        position.stage = len(config.stages)
+        data.close()
+        if rank == 0:
+            provenance = {**source, "steps": position.step, "losses": losses}
+            save_model(out / "model.safetensors", model, config, provenance)
+            save_resume(out / "resume.safetensors", model, optimizer, names, _state(position, key))
+        log.close()
+        return Trained(out / "model.safetensors", position.step, finished=True, losses=losses)
+
+
+def _key(config: Config, manifest: str, minutes: float | None) -> str:
+    """Digest of all that decides what a run computes; a resume point of another run is refused."""
+    return hashlib.sha256(f"{dumps_config(config)}|{manifest}|{minutes}".encode()).hexdigest()
+
+
+def _state(position: Position, key: str) -> dict[str, Any]:
+    return {"key": key, **position.__dict__}
+
+
+def _resume(out: Path, model: JointModel, key: str) -> tuple[Position, dict[str, dict[str, Tensor]]]:
+    """Load the resume point of a folder into the model, if there is one."""
+    path = Path(out) / "resume.safetensors"
+    if not path.exists():
+        return Position(), {}
+    weights, moments, state = load_resume(path)
+    if state.pop("key", None) != key:
+        raise ConfigError(
+            f"{out}: holds a run with another configuration, dataset or budget",
+            hint="choose another --out, or delete it",
+        )
+    load_strictly(model, weights, path)
+    return Position(**state), moments
+
+
+def _restore(
+    optimizer: torch.optim.Adam, names: Mapping[int, str], moments: Mapping[str, dict[str, Tensor]]
+) -> None:
+    """Give Adam its moments back."""
+    for group in optimizer.param_groups:
+        for parameter in group["params"]:
+            saved = moments.get(names[id(parameter)])
+            if saved:
+                kept = {
+                    k: v if k == "step" else torch.empty_like(parameter).copy_(v) for k, v in saved.items()
+                }
+                optimizer.state[parameter] = kept
+
+
+def _done(position: Position, stage: Stage, budget: float | None) -> bool:
+    return position.epoch >= stage.epochs if budget is None else position.elapsed >= budget
+
+
+def _elapsed(started: float, place: torch.device, world: int) -> float:
+    """Seconds in this stage: those of the slowest process, so that all of them stop at the same step."""
+    seconds = time.monotonic() - started
+    if world == 1:
+        return seconds
+    slowest = torch.tensor(seconds, device=place, dtype=torch.float32)
+    torch.distributed.all_reduce(slowest, torch.distributed.ReduceOp.MAX)
+    return float(slowest)
+
+
+def _progress(position: Position, stage: Stage, batches: int, budget: float | None) -> float:
+    """Fraction of the stage that is done, by steps, or by the clock where there is a budget."""
+    if budget is not None:
+        return min(position.elapsed / budget, 1.0)
+    return (position.epoch + position.batch / batches) / stage.epochs
+
+
+def _learning_rate(optimizer: torch.optim.Adam, stage: Stage, schedule: str, progress: float) -> float:
+    """Set and return the rate: constant, or a cosine to zero after a short warm-up (2 % of the stage)."""
+    rate = stage.learning_rate
+    if schedule == "cosine":
+        rate *= min(1.0, 0.1 + progress / 0.02) * max(0.5 * (1 + math.cos(math.pi * progress)), 1e-3)
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+    return rate
+
+
+def _validate(model: JointModel, dataset: Path, place: torch.device) -> dict[str, float]:
+    """MAE (m) and mean angle (deg) on the first frames of the ``val`` split; empty where there is no such split."""
+    if not load_manifest(dataset).split("val"):
+        return {}
+    data = FrameDataset(dataset, "val", frames=1, cache_bytes=0)
+    model.eval()
+    table = score({"model": model_method(model)}, data, place)[0]["model"].table()
+    model.train()
+    data.close()
+    if not table["depth"]["pixel"]["pixels"]:
+        return {}
+    return {"val_mae": table["depth"]["pixel"]["mae"], "val_angle_deg": table["normal"]["pixel"]["mean_deg"]}
+
+
+class _Log:
+    """``metrics.jsonl`` always, TensorBoard where it is installed; silent for processes that are not the first."""
+
+    def __init__(self, out: Path | None) -> None:
+        self._file, self._board = None, None
+        if out is None:
+            return
+        out.mkdir(parents=True, exist_ok=True)
+        self._file = (out / "metrics.jsonl").open("a", encoding="utf-8")
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            return
+        self._board = SummaryWriter(str(out / "tensorboard"))  # type: ignore[no-untyped-call]
+
+    def _write(self, step: int, row: Mapping[str, Any]) -> None:
+        if self._file is not None:
+            self._file.write(json.dumps({"step": step, **row}) + "\n")
+            self._file.flush()
+        for name, value in row.items() if self._board is not None else ():
+            if isinstance(value, float):
+                self._board.add_scalar(name, value, step)  # type: ignore[union-attr,no-untyped-call]
+
+    def step(self, position: Position, stage: Stage, loss: Objective, rate: float) -> dict[str, float]:
+        """Log one step; return its losses."""
+        losses = {
+            "total": float(loss.total.detach()),
+            **{k: float(v.detach()) for k, v in loss.parts.items()},
+        }
+        row: dict[str, Any] = {
+            "stage": stage.name,
+            "epoch": position.epoch,
+            "seconds": position.elapsed,
+            "rate": rate,
+        }
+        if "chamfer" in losses:
+            row["winners"] = loss.winners.tolist()
+        self._write(position.step, row | losses)
+        return losses
+
+    def validation(self, position: Position, stage: Stage, values: Mapping[str, float]) -> None:
+        """Log a validation."""
+        if values:
+            self._write(position.step, {"stage": stage.name, "epoch": position.epoch, **values})
+
+    def close(self) -> None:
+        """Close the files."""
+        if self._file is not None:
+            self._file.close()
+        if self._board is not None:
+            self._board.close()  # type: ignore[no-untyped-call]
