@@ -18,7 +18,9 @@ from tofcapture.poses import Float64
 
 COARSE_TO_FINE = (0.080, 0.040, 0.020, 0.010)  # m, correspondence distances
 FINE = (0.020, 0.010)  # m, from a good initial guess
-COARSE_STRIDE = 4  # above FINE, every fourth source point finds the same basin
+COARSE_STRIDE = (
+    4  # above FINE every fourth source point finds the same basin; point-to-point gains nothing from the rest
+)
 MAX_ITERATIONS = 50
 
 Backend = Callable[[Float64, Cloud, Float64, Sequence[float]], Registration]
@@ -59,7 +61,8 @@ def register_open3d(
     stop = icp.ICPConvergenceCriteria(1e-7, 1e-7, MAX_ITERATIONS)
     T = initial
     for distance in distances:
-        points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_thin(source, distance)))
+        thin = source[:: COARSE_STRIDE if distance > max(FINE) else 1]
+        points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(thin))
         to_plane = icp.TransformationEstimationPointToPlane(icp.TukeyLoss(k=distance))
         T = icp.registration_icp(points, dense, distance, T, to_plane, stop).transformation
     return measure_registration(T, source, target)
@@ -81,13 +84,13 @@ def register_kiss_icp(
     if check_clouds(source, target) is not None:
         return measure_registration(initial, source, target)
     mapping, registration = _load_kiss_icp()
-    solver = registration.Registration(10 * MAX_ITERATIONS, 1e-6, 1)
+    solver = registration.Registration(2 * MAX_ITERATIONS, 1e-5, 1)
     T = initial
     for distance in distances:
         # The map looks for partners in the 27 voxels around a point only, so its voxels must be as large as the distance.
         dense = mapping.VoxelHashMap(distance, 100.0, 20)
         dense.add_points(target.points)
-        T = solver.align_points_to_map(_thin(source, distance), dense, T, distance, distance / 3)
+        T = solver.align_points_to_map(source[::COARSE_STRIDE], dense, T, distance, distance / 3)
     return measure_registration(T, source, target)
 
 
@@ -112,10 +115,6 @@ def register(
 ) -> Registration:
     """Register by the backend of that name; a plain function, so that it travels to a worker process."""
     return backend_named(name)(source, target, initial, distances)
-
-
-def _thin(source: Float64, distance: float) -> Float64:
-    return source[::COARSE_STRIDE] if distance > max(FINE) else source
 
 
 def _load_kiss_icp() -> tuple[Any, Any]:

@@ -19,7 +19,10 @@ from tofcapture.rig import SPEED_OF_LIGHT
 
 Mask = NDArray[np.bool_]
 
-WORKING_DEPTH = (0.2, 1.8)  # m; where a 240x180 sensor of this kind measures validly (UD-ToF: 0.180 to 1.788 m)
+WORKING_DEPTH = (
+    0.2,
+    1.8,
+)  # m; where a 240x180 sensor of this kind measures validly (UD-ToF: 0.180 to 1.788 m)
 TOF_JUMP = 0.012  # m; departure from the local plane that marks a depth edge, over 4 sigma of a burst's noise
 TOF_MARGIN = 2  # px around a ToF depth edge that mixed pixels may reach
 STEREO_JUMP = 0.004  # m; the same on the reduced stereo grid, whose noise is ten times lower
@@ -29,14 +32,14 @@ MAX_SIGMA = 0.004  # m; predicted range noise of a burst-averaged pixel above wh
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points with normals.
+    """Points with the directions along which they are held.
 
     Attributes
     ----------
     points
         (N, 3) float64, metres, finite.
     normals
-        (N, 3) float64, unit, facing the camera at the origin of the points' frame.
+        (N, 3) float64, unit: of the surface, facing the camera at the origin of the points' frame; of a rim, across it.
     """
 
     points: Float64
@@ -44,7 +47,9 @@ class Cloud:
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.shape != self.normals.shape:
-            raise DataError(f"cloud: expected points and normals (N, 3), got {self.points.shape}, {self.normals.shape}")
+            raise DataError(
+                f"cloud: expected points and normals (N, 3), got {self.points.shape}, {self.normals.shape}"
+            )
 
     def __len__(self) -> int:
         return len(self.points)
@@ -55,7 +60,7 @@ def dilate(mask: Mask, pixels: int) -> Mask:
     out = np.pad(mask, pixels)
     for axis in (0, 1):
         windows = np.lib.stride_tricks.sliding_window_view(out, 2 * pixels + 1, axis=axis)
-        out = windows.any(axis=-1)
+        out = np.asarray(windows.any(axis=-1))
     return out
 
 
@@ -124,31 +129,62 @@ def range_sigma(burst: TofBurst) -> Float64:
     return out
 
 
-def tof_points(burst: TofBurst) -> Float64:
-    """Trustworthy ToF points of a burst.
+def tof_depth(burst: TofBurst) -> tuple[NDArray[np.complex128], Float64]:
+    """Average a burst as phasors and decode it with the camera's own range errors.
 
-    The burst is averaged as phasors and decoded with the camera's own range errors. Saturated pixels, dark pixels, pixels
-    within two of a depth edge and everything outside the working depth are dropped.
+    Returns
+    -------
+    phasor
+        (F, H, W) complex128, raw units.
+    depth
+        (H, W) float64, metres; NaN where a tap was saturated or nothing can be decoded.
+    """
+    info = burst.info
+    saturated = np.asarray((burst.raw >= info.saturation).any(axis=(0, 1)))
+    phasor = phase.mean_phasors(burst.raw, info.modulation_hz, info.phase_rad)
+    celsius = float(np.mean(burst.celsius))
+    decoded = phase.decode(
+        phasor, info.modulation_hz, info.camera, info.illuminator, info.range_errors, celsius, saturated
+    )
+    return phasor, info.camera.radial_to_depth(decoded.radial)
+
+
+def surface_points(burst: TofBurst, depth: Float64) -> Float64:
+    """Trustworthy points on the surface that the rig looks at.
+
+    Dark pixels, pixels within two of a depth edge and everything outside the working depth are dropped. What is left falls
+    apart into pieces; the one that fills most of the image's centre is the board. Other surfaces see the board's light, which
+    lengthens their ranges by up to a centimetre.
+
+    Parameters
+    ----------
+    burst
+        Raw frames.
+    depth
+        (H, W) of :func:`tof_depth`, metres.
 
     Returns
     -------
     (N, 3) float64, ToF frame, metres.
     """
-    info = burst.info
-    saturated: Mask = (burst.raw >= info.saturation).any(axis=(0, 1))
-    phasor = phase.mean_phasors(burst.raw, info.modulation_hz, info.phase_rad)
-    celsius = float(np.mean(burst.celsius))
-    decoded = phase.decode(phasor, info.modulation_hz, info.camera, info.illuminator, info.range_errors, celsius, saturated)
-    depth = info.camera.radial_to_depth(decoded.radial)
+    from scipy.ndimage import label
+
     edge = dilate(plane_departure(depth) > TOF_JUMP, TOF_MARGIN)
     good = ~edge & (range_sigma(burst) < MAX_SIGMA) & _within(depth)
-    return info.camera.unproject(depth)[good]
+    pieces, count = label(good)
+    height, width = depth.shape
+    centre = pieces[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    sizes = np.bincount(centre.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    board = good & (pieces == sizes.argmax())
+    points: Float64 = burst.info.camera.unproject(depth)[board]
+    return points
 
 
 def stereo_cloud(frame: StereoFrame, block: int = STEREO_BLOCK) -> Cloud:
     """Dense stereo points, averaged over blocks of the organised grid, with normals.
 
-    A block counts only when it is complete; blocks at depth edges, where stereo matchers draw veils, are dropped.
+    Blocks that miss more than a quarter of their pixels, or lie at depth edges, where stereo matchers draw veils, are dropped.
 
     Parameters
     ----------
@@ -164,12 +200,21 @@ def stereo_cloud(frame: StereoFrame, block: int = STEREO_BLOCK) -> Cloud:
     """
     height, width = (n // block for n in frame.points.shape[:2])
     tiles = frame.points[: height * block, : width * block].reshape(height, block, width, block, 3)
-    points = tiles.mean(axis=(1, 3), dtype=np.float64)
+    points = _block_means(tiles)
     normals = grid_normals(points)
     depth = points[..., 2]
     edge = dilate(plane_departure(depth) > STEREO_JUMP, 1)
     good = ~edge & np.isfinite(normals).all(axis=-1) & _within(depth)
     return Cloud(points[good], normals[good])
+
+
+def _block_means(tiles: NDArray[np.floating]) -> Float64:
+    """Mean points (h, w, 3) of tiles (h, b, w, b, 3); NaN where more than a quarter is missing."""
+    present = np.isfinite(tiles[..., 2])
+    count = present.sum(axis=(1, 3))
+    total = np.where(present[..., None], tiles, 0).sum(axis=(1, 3), dtype=np.float64)
+    enough = 4 * count >= 3 * tiles.shape[1] * tiles.shape[3]
+    return np.where(enough[..., None], total / np.maximum(count, 1)[..., None], np.nan)
 
 
 def _within(depth: NDArray[np.floating]) -> Mask:

@@ -19,7 +19,7 @@ from tofcapture.poses import Float64, invert, rotation_angle, transform_points
 INLIER_DISTANCE = 0.010  # m; a ToF point this near to a stereo point has found its surface, bias included
 MIN_POINTS = 200  # fewer do not average the noise of a ToF pixel to a tenth
 MIN_FITNESS = 0.3  # share of source points with a partner; the fields of view of a rig overlap by far more
-MAX_CONDITION = 1e4  # a lone plane exceeds it, three planes of a corner stay below 100
+MAX_CONDITION = 500.0  # a board held by its rims has 3 to 10, a corner below 100, a lone plane thousands
 MAX_ROTATION = np.radians(10.0)  # from the initial guess, which a bracket's drawing gives to 1 or 2 degrees
 MAX_TRANSLATION = 0.10  # m, from the initial guess, at the points
 MAX_STEP_ROTATION = np.radians(0.5)  # one more Newton step of a converged result is far smaller
@@ -179,10 +179,14 @@ def measure_registration(T_target_source: Float64, source: Float64, target: Clou
 
 def _nothing(T_target_source: Float64, inliers: int = 0, fitness: float = 0.0) -> Registration:
     centre = T_target_source[:3, 3]
-    return Registration(T_target_source, inliers, np.nan, fitness, np.zeros((6, 6)), np.inf, centre, np.zeros(6))
+    return Registration(
+        T_target_source, inliers, np.nan, fitness, np.zeros((6, 6)), np.inf, centre, np.zeros(6)
+    )
 
 
-def check_registration(result: Registration, source: Float64, target: Cloud, initial: Float64) -> Refusal | None:
+def check_registration(
+    result: Registration, source: Float64, target: Cloud, initial: Float64
+) -> Refusal | None:
     """Gate a measured registration.
 
     Parameters
@@ -207,7 +211,10 @@ def check_registration(result: Registration, source: Float64, target: Cloud, ini
         return Refusal.PLANAR
     if _too_far(result, initial):
         return Refusal.DIVERGED
-    if np.linalg.norm(result.step[:3]) > MAX_STEP_TRANSLATION or np.linalg.norm(result.step[3:]) > MAX_STEP_ROTATION:
+    if (
+        np.linalg.norm(result.step[:3]) > MAX_STEP_TRANSLATION
+        or np.linalg.norm(result.step[3:]) > MAX_STEP_ROTATION
+    ):
         return Refusal.NOT_CONVERGED
     return Refusal.POOR_FIT if result.rmse > MAX_RMSE else None
 

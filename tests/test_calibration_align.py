@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+import argparse
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from calibration.cli import ALIGN
+from calibration.clouds import Cloud, grid_normals, plane_departure, stereo_cloud, surface_points, tof_depth
+from calibration.evidence import alignment_error
+from calibration.pairs import pair_of
+from calibration.range_residual import RangeResidual, fit_range_residual, no_residual
+from calibration.registration import Refusal, check_registration, measure_registration, residuals
+from calibration.rims import rim_cloud, stereo_rims, tof_rims
+from calibration.solve import _common_rig, align
 from tofcapture import poses
 from tofcapture.camera import Camera
+from tofcapture.errors import ConfigError, DataError, QualityError
+from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth, View
 from tofcapture.o3d import load_open3d
 from tofcapture.ops import phase
-from tofcapture.rig import Rig
+from tofcapture.rig import Rig, load_rig
 
 TOF = Camera(240, 180, 190.6186, 200.7526, 116.8406, 101.4767)
 STEREO = Camera(640, 512, 575.0, 575.0, 319.5, 255.5)
@@ -32,9 +46,14 @@ def board_meshes():
     o3d = load_open3d()
     tilt = poses.transform(poses.rotation_exp([0.0, -0.35, 0.0]), [0.0, 0.0, 0.27])
     strips = [
-        ((0.01, 0.5, 0.06), (0, 0, 0.17)), ((0.01, 0.5, 0.05), (0, 0, -0.175)), ((0.01, 0.5, 0.05), (0, 0, 0.03)),
-        ((0.01, 0.06, 0.4), (0, 0.22, 0)), ((0.01, 0.05, 0.4), (0, -0.225, 0)), ((0.01, 0.07, 0.2), (0, 0.02, 0.1)),
-        ((0.01, 0.12, 0.2), (0, -0.06, -0.1)), ((0.01, 0.1, 0.1), (0, 0.15, 0.1)),
+        ((0.01, 0.5, 0.06), (0, 0, 0.17)),
+        ((0.01, 0.5, 0.05), (0, 0, -0.175)),
+        ((0.01, 0.5, 0.05), (0, 0, 0.03)),
+        ((0.01, 0.06, 0.4), (0, 0.22, 0)),
+        ((0.01, 0.05, 0.4), (0, -0.225, 0)),
+        ((0.01, 0.07, 0.2), (0, 0.02, 0.1)),
+        ((0.01, 0.12, 0.2), (0, -0.06, -0.1)),
+        ((0.01, 0.1, 0.1), (0, 0.15, 0.1)),
     ]
     meshes = [box_mesh(size, tilt @ poses.transform(np.eye(3), at)) for size, at in strips]
     turned = poses.rotation_exp([0.0, 0.0, 0.6])
@@ -96,23 +115,226 @@ def stereo_frame(scene, T_world_stereo, rng):
     seen, _ = cast(scene, T_world_stereo @ eye, np.nan_to_num(points - eye[:3, 3], nan=1.0))
     good = (cosine > np.cos(np.radians(70))) & (np.abs(seen - 1) < 0.003) & (depth < 3)
     noisy = points * (1 + rng.normal(0, 3e-4, depth.shape))[..., None]
-    return StereoFrame(np.where(good[..., None], noisy, np.nan).astype(np.float32), 0, StereoInfo("test", "0", STEREO))
+    return StereoFrame(
+        np.where(good[..., None], noisy, np.nan).astype(np.float32), 0, StereoInfo("test", "0", STEREO)
+    )
 
 
 def simulated_view(index, seed=0, frames=4, wiggle=0.001, scatter=0.003, meshes=None, T_world_tof=None):
     """One view of the board from a direction tilted 15 to 40 degrees, 0.55 to 0.95 m away."""
     rng = np.random.default_rng([seed, index])
     if T_world_tof is None:
-        yaw, pitch = np.radians(38) * np.sin(2.4 * index + 0.5), np.radians(20 + 16 * np.cos(2.4 * index + 0.5))
+        yaw, pitch = (
+            np.radians(38) * np.sin(2.4 * index + 0.5),
+            np.radians(20 + 16 * np.cos(2.4 * index + 0.5)),
+        )
         away = 0.55 + 0.4 * ((index * 0.618) % 1)
-        eye = np.array([0, 0, 0.25]) + away * np.array([-np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+        eye = np.array([0, 0, 0.25]) + away * np.array(
+            [-np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)]
+        )
         T_world_tof = poses.look_at(eye, [0, 0, 0.23], roll=rng.uniform(-0.3, 0.3))
     scene = scene_of(board_meshes() if meshes is None else meshes)
     burst, _ = tof_burst(scene, T_world_tof, rng, frames, wiggle, scatter)
     state = ArmState(np.zeros(6), np.eye(4), 0)
     fine = TOF.scaled(2).shape
     truth = Truth(
-        np.full(fine, np.nan, np.float32), np.full((*fine, 3), np.nan, np.float32), np.zeros(fine, bool), TRUE, np.eye(4)
+        np.full(fine, np.nan, np.float32),
+        np.full((*fine, 3), np.nan, np.float32),
+        np.zeros(fine, bool),
+        TRUE,
+        np.eye(4),
     )
     rig = Rig(TOF, STEREO, GUESS, np.eye(4))
-    return View("calibration", index, burst, stereo_frame(scene, T_world_tof @ TRUE, rng), state, state, rig, {}, truth)
+    return View(
+        "calibration",
+        index,
+        burst,
+        stereo_frame(scene, T_world_tof @ TRUE, rng),
+        state,
+        state,
+        rig,
+        {},
+        truth,
+    )
+
+
+@pytest.fixture(scope="module")
+def views():
+    return [simulated_view(i) for i in range(6)]
+
+
+@pytest.fixture(scope="module")
+def recording(views, tmp_path_factory):
+    """Recording folder with six board views."""
+    folder = tmp_path_factory.mktemp("recording")
+    for view in views:
+        write_view(view_path(folder, "calibration", view.index), view)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def aligned(recording):
+    """The recording after ``align``: rig and evidence."""
+    return align(recording)
+
+
+def test_align_recovers_the_rig(aligned):
+    """From a guess off by 1.5 degrees and 1.5 cm, six views bring the true rig to 0.1 degrees and 1 mm at 0.8 m."""
+    rig, evidence = aligned
+    rotation, translation = alignment_error(rig.T_tof_stereo, TRUE)
+    assert np.degrees(rotation) < 0.1
+    assert translation < 0.001
+    assert evidence["truth"]["rotation_error_deg"] == pytest.approx(np.degrees(rotation))
+    assert evidence["truth"]["translation_error_mm"] == pytest.approx(1e3 * translation)
+
+
+def test_align_keeps_what_it_does_not_measure(aligned):
+    """Only T_tof_stereo changes; the initial guess is stated."""
+    rig, evidence = aligned
+    assert (rig.tof, rig.stereo) == (TOF, STEREO)
+    np.testing.assert_array_equal(rig.T_flange_tof, np.eye(4))
+    np.testing.assert_array_equal(evidence["initial_T_tof_stereo"], GUESS)
+
+
+def test_align_writes_rig_and_evidence(recording, aligned):
+    """The files hold what the function returned, and no partial file is left."""
+    rig, evidence = aligned
+    np.testing.assert_array_equal(load_rig(recording / "rig.toml").T_tof_stereo, rig.T_tof_stereo)
+    assert json.loads((recording / "evidence.json").read_text()) == evidence
+    assert not list(recording.glob(".*partial"))
+
+
+def test_evidence_tells_every_pair(aligned):
+    """Each view has a row with its residual, and the rows agree with the counts."""
+    _, evidence = aligned
+    assert (evidence["format"], evidence["version"], evidence["views"]) == ("tofcapture-evidence", 1, 6)
+    assert evidence["used"] == sum(pair["accepted"] for pair in evidence["pairs"]) >= 4
+    assert all(pair["rmse_mm"] < 3 and pair["inliers"] > 1000 for pair in evidence["pairs"])
+    assert [pair["view"] for pair in evidence["pairs"]] == list(evidence["provenance"]["inputs"])
+
+
+def test_same_recording_gives_the_same_bytes(recording, aligned):
+    """A second run, started from the first one's files, writes identical files."""
+    before = [(recording / name).read_bytes() for name in ("rig.toml", "evidence.json")]
+    align(recording)
+    assert [(recording / name).read_bytes() for name in ("rig.toml", "evidence.json")] == before
+
+
+def test_recording_without_board_views_says_what_to_do(tmp_path):
+    """An empty recording is a data error whose hint is the command that fills it."""
+    with pytest.raises(DataError, match="calibration views") as caught:
+        align(tmp_path)
+    assert "record --calibration" in caught.value.hint
+
+
+def test_too_few_good_pairs_write_nothing(views, tmp_path):
+    """Two views cannot be averaged: a quality error with the reasons, and no rig.toml."""
+    for view in views[:2]:
+        write_view(view_path(tmp_path, "calibration", view.index), view)
+    with pytest.raises(QualityError, match="at least 3"):
+        align(tmp_path)
+    assert not (tmp_path / "rig.toml").exists()
+
+
+def test_unknown_backend_fails_before_any_work(tmp_path):
+    """The backend's name is checked first."""
+    with pytest.raises(ConfigError, match="open3d"):
+        align(tmp_path, backend="teaser")
+
+
+def test_views_of_another_camera_are_refused(views):
+    """One recording holds one rig."""
+    pairs = [pair_of(view, f"view-{view.index}", "") for view in views[:2]]
+    other = replace(pairs[1], rig=replace(pairs[1].rig, tof=replace(TOF, fx=200.0)))
+    with pytest.raises(DataError, match="other cameras"):
+        _common_rig([pairs[0], other])
+
+
+def test_view_that_saw_nothing_is_an_empty_pair():
+    """Dead cameras give an empty pair and no numerical warnings; the gate calls it empty."""
+    view = simulated_view(0, frames=2)
+    dark = replace(view.tof, raw=np.zeros_like(view.tof.raw))
+    blind = replace(view.stereo, points=np.full_like(view.stereo.points, np.nan))
+    pair = pair_of(replace(view, tof=dark, stereo=blind), "view-000", "")
+    result = measure_registration(np.eye(4), pair.source, pair.target)
+    assert (len(pair.source), len(pair.target)) == (0, 0)
+    assert check_registration(result, pair.source, pair.target, np.eye(4)) is Refusal.EMPTY
+
+
+def test_surface_points_lie_on_the_board(views):
+    """What survives of a view lies within millimetres of the true board: no flying pixels, no background."""
+    view = simulated_view(1, wiggle=0.0, scatter=0.0)
+    _, depth = tof_depth(view.tof)
+    points = surface_points(view.tof, depth)
+    found = residuals(points, stereo_cloud(view.stereo), poses.invert(TRUE))
+    assert len(points) > 1000
+    assert len(found.source) > 0.9 * len(points)
+    assert np.quantile(np.abs(found.distance), 0.99) < 0.009
+    assert abs(np.median(found.distance)) < 0.0005
+
+
+def test_rims_of_both_cameras_agree_at_the_true_rig():
+    """ToF rims come to lie on stereo rims to half a millimetre in the median, a tenth of a ToF pixel."""
+    view = simulated_view(3)
+    phasor, depth = tof_depth(view.tof)
+    tof = tof_rims(phasor, depth, TOF)
+    stereo = rim_cloud(stereo_rims(view.stereo.points), poses.invert(TRUE)[:3, 3])
+    found = residuals(tof.points, stereo, poses.invert(TRUE))
+    assert len(found.source) > 100
+    assert abs(np.median(found.distance)) < 0.0005
+    assert np.median(np.abs(found.distance)) < 0.001
+
+
+def test_plane_departure_is_zero_on_any_plane_and_half_a_jump_at_an_edge():
+    """Inverse depth is linear on a plane; across a step the departure is about half of the step."""
+    normal = np.array([0.6, -0.3, 0.8])
+    depth = 0.8 / (TOF.rays @ normal)
+    assert plane_departure(depth)[1:-1, 1:-1].max() < 1e-12
+    depth = np.full((9, 9), 0.8)
+    depth[:, 5:] = 0.81
+    assert plane_departure(depth)[4, 4] == pytest.approx(0.005, rel=0.05)
+    assert plane_departure(depth)[4, 2] == 0
+
+
+def test_grid_normals_of_a_plane_are_exact_and_face_the_camera():
+    """On a noise-free plane the organised normals are the plane's."""
+    normal = np.array([0.3, -0.2, -0.9]) / np.linalg.norm([0.3, -0.2, -0.9])
+    points = TOF.rays * (-0.8 / (TOF.rays @ normal))[..., None]
+    np.testing.assert_allclose(
+        grid_normals(points)[1:-1, 1:-1], np.broadcast_to(normal, (*TOF.shape, 3))[1:-1, 1:-1], atol=1e-9
+    )
+
+
+def test_range_residual_recovers_a_wave():
+    """A wave put on the ranges of six tilted planes is found to a tenth of a millimetre with their poses unknown."""
+    rng = np.random.default_rng(0)
+    truth = RangeResidual(TOF, 100e6, np.array([0, 0, 0, 0, 0.001, -0.002, 0, 0]))
+    sources, targets, registrations = [], [], []
+    for _ in range(6):
+        normal = np.append(rng.uniform(-0.5, 0.5, 2), 1.0)
+        exact = (TOF.rays * (rng.uniform(0.6, 1.0) / (TOF.rays @ normal))[..., None])[::2, ::2].reshape(-1, 3)
+        unit = -normal / np.linalg.norm(normal)
+        target = Cloud(exact, np.tile(unit, (len(exact), 1)))
+        sources.append(
+            exact + exact * (truth.terms(exact) @ truth.coefficients / np.linalg.norm(exact, axis=1))[:, None]
+        )
+        targets.append(target)
+        registrations.append(measure_registration(np.eye(4), sources[-1], target))
+    found = fit_range_residual(sources, targets, registrations, no_residual(TOF, 100e6))
+    np.testing.assert_allclose(found.coefficients[4:6], truth.coefficients[4:6], atol=2e-4)
+
+
+def test_align_command_reports_as_text_and_json(recording, monkeypatch):
+    """The command's text is a table with a verdict; its data is JSON and holds spread, error and paths."""
+    evidence = json.loads((recording / "evidence.json").read_text())
+    rig = load_rig(recording / "rig.toml")
+    monkeypatch.setattr("calibration.solve.align", lambda *_: (rig, evidence))
+    parser = argparse.ArgumentParser()
+    ALIGN.configure(parser)
+    outcome = ALIGN.run(parser.parse_args([str(recording)]))
+    assert "verdict: " in outcome.text
+    assert outcome.text.count("view-") == 6
+    data = json.loads(json.dumps(outcome.data))
+    assert data["rotation_error_deg"] < 0.1
+    assert data["rig"] == str(recording / "rig.toml")
+    assert {"spread", "standard_error", "pairs", "evidence", "translation_error_mm"} <= data.keys()

@@ -171,10 +171,9 @@ def _configure_report(parser: argparse.ArgumentParser) -> None:
 
 
 def _report(args: argparse.Namespace) -> Outcome:
-    from tofcapture_model import report
+    from tofcapture_model.report import run
 
-    outcome: Outcome = report.run(args)
-    return outcome
+    return run(args)
 
 
 TRAIN = Command(

@@ -211,13 +211,12 @@ def _changed(part: Part, table: Any, where: str) -> Part:
             f"{where}: unknown key {', '.join(sorted(unknown))}", hint=f"known: {', '.join(sorted(known))}"
         )
     values: dict[str, Any] = {}
-    for key, value in table.items():
+    for key, raw in table.items():
         default = getattr(part, key)
-        value = tuple(value) if isinstance(value, list) else value
-        value = float(value) if isinstance(default, float) and type(value) is int else value
-        if type(value) is not type(default):
-            raise ConfigError(f"{where}.{key}: expected {type(default).__name__}, got {value!r}")
-        values[key] = value
+        value = tuple(raw) if isinstance(raw, list) else raw
+        values[key] = float(value) if isinstance(default, float) and type(value) is int else value
+        if type(values[key]) is not type(default):
+            raise ConfigError(f"{where}.{key}: expected {type(default).__name__}, got {raw!r}")
     return replace(part, **values)
 
 

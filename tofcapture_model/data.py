@@ -21,6 +21,7 @@ from tofcapture.files.shard import ShardReader
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoded, ambiguity, decode, frequencies, phasors
 from tofcapture_model.frame import Frame, Target
+from tofcapture_model.multipath import cues
 
 Float32 = NDArray[np.float32]
 MAX_RANGE = 5.0  # m; a decoded depth beyond it is an unwrapping failure on this rig and counts as a hole
@@ -79,14 +80,20 @@ def make_frame(raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float 
     low = ambiguity(frequencies(info.modulation_hz)[0])
     gap = np.mod(decoded.range_low - decoded.range_high + low / 2, low) - low / 2
     iq = np.stack([part for z in phasor for part in (z.real, z.imag)])
-    return Frame(
+    frame = Frame(
         raw=_tensor(raw / info.saturation),
         phasor=_tensor(iq / info.saturation),
         depth=_tensor(fill_nearest(depth, valid)[None]),
         valid=_tensor(valid[None]),
         confidence=_tensor(decoded.confidence[None] / info.saturation),
         gap=_tensor(gap[None]),
+        cues=torch.empty(0),
         intrinsics=torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy]),
+    )
+    whole = batched(frame)
+    high = frequencies(info.modulation_hz)[1]
+    return frame._replace(
+        cues=cues(whole.phasor, whole.depth, whole.valid, whole.gap, whole.intrinsics, high)[0]
     )
 
 

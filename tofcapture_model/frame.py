@@ -25,6 +25,8 @@ class Frame(NamedTuple):
         (B, 1, H, W) amplitude of the high frequency in units of the saturation value.
     gap
         (B, 1, H, W) range of the low minus range of the high frequency, metres: the multipath cue.
+    cues
+        (B, 3, H, W) depth errors that physics expects, metres: see :func:`tofcapture_model.multipath.cues`.
     intrinsics
         (B, 4) fx, fy, cx, cy in pixels of the (H, W) grid.
     """
@@ -35,6 +37,7 @@ class Frame(NamedTuple):
     valid: Tensor
     confidence: Tensor
     gap: Tensor
+    cues: Tensor
     intrinsics: Tensor
 
 

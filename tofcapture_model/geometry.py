@@ -91,7 +91,8 @@ def local_planes(depth: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Ten
     s1, su, sv, suu, suv, svv = F.conv2d(valid, bank, padding=radius).unbind(1)
     t1, tu, tv = F.conv2d(i, bank[:3], padding=radius).unbind(1)
     tt = F.conv2d(i * (inverse - origin), bank[:1], padding=radius)[:, 0]
-    ridge = 1e-6 * suu + _TINY  # a window with one row or column of pixels has a slope of zero across it
+    # a window with one row or column of pixels has a slope of zero across it
+    ridge = 10 * torch.finfo(depth.dtype).eps * suu + _TINY
     n = s1.clamp_min(_TINY)
     mu, mv, mi = su / n, sv / n, t1 / n
     cuu, cvv, cuv = suu - su * mu + ridge, svv - sv * mv + ridge, suv - su * mv

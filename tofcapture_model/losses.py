@@ -13,7 +13,7 @@ from torch import Tensor
 from tofcapture_model.chamfer import Chamfer, robust_chamfer, search_radius
 from tofcapture_model.config import Losses
 from tofcapture_model.frame import Estimate, Target
-from tofcapture_model.geometry import unproject
+from tofcapture_model.geometry import unit, unproject
 
 _PER_MM2 = 1e6  # m^2 to mm^2, so that the Chamfer weight is of the order of the others
 DELTA = 0.020  # m, paper: threshold 20 (mm) of eq. 1
@@ -26,6 +26,11 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     weight = mask.to(values.dtype).expand_as(values)
     kept = torch.where(weight > 0, values, torch.zeros_like(values))
     return (kept * weight).sum() / weight.sum().clamp_min(1e-6)
+
+
+def _inside(gt: Tensor, mask: Tensor, otherwise: Tensor) -> Tensor:
+    """Ground truth inside the mask; outside it may be NaN, whose gradient a later mask would not stop."""
+    return torch.where(mask > 0, gt.float(), otherwise.detach().float())
 
 
 def reweighting(gt: Tensor, error: Tensor, mask: Tensor) -> Tensor:
@@ -62,13 +67,14 @@ def reweighted_smooth_l1(
     -------
     Scalar without unit; scaling all lengths by k, delta included, leaves it unchanged.
     """
-    weight = reweighting(gt.float(), error.float(), mask)
-    return masked_mean(weight * smooth_l1(depth.float() - gt.float(), delta), mask)
+    gt = _inside(gt, mask, depth)
+    weight = reweighting(gt, error.float(), mask)
+    return masked_mean(weight * smooth_l1(depth.float() - gt, delta), mask)
 
 
 def error_map_loss(error: Tensor, depth: Tensor, gt: Tensor, mask: Tensor, delta: float = DELTA) -> Tensor:
     """Hold the error map against ``|d - d_gt|`` of the detached depth, l1 in units of delta, mean over the mask."""
-    truth = (depth.detach().float() - gt.float()).abs()
+    truth = (depth.detach().float() - _inside(gt, mask, depth)).abs()
     return masked_mean((error.float() - truth).abs() / delta, mask)
 
 
@@ -82,7 +88,9 @@ def cosine_loss(normals: Tensor, gt: Tensor, mask: Tensor) -> Tensor:
     mask
         (B, 1, H, W) bool or weight.
     """
-    cosine = torch.cosine_similarity(normals.float(), gt.float(), dim=1, eps=1e-6)[:, None]
+    cosine = (unit(normals.float()) * unit(_inside(gt, mask, normals))).sum(
+        1, keepdim=True
+    )  # torch's own is 5 times slower on CPU
     return masked_mean(1 - cosine, mask)
 
 

@@ -17,6 +17,7 @@ from tofcapture_model.frame import Frame
 from tofcapture_model.geometry import plane_normals, rays, side_window_planes, unit
 from tofcapture_model.unet import CONVEX_CHANNELS, UNet, bilinear_logits, convex_upsample
 
+CUE_SCALE = (1.0, 0.01, 0.3)  # what one may expect of each cue: most lenses scatter about one percent
 RESIDUAL_UNIT = 0.01  # m; a head's output of 1 moves the depth by a centimetre
 _PHASOR_FLOOR = 1e-4  # of saturation; below it an amplitude is noise
 
@@ -29,7 +30,7 @@ class Features(NamedTuple):
     image
         (B, C, H, W) for the convolutions, about unit scale.
     candidates
-        (B, K, H, W) classically denoised depths, metres; K may be 0.
+        (B, K, H, W) classically denoised or corrected depths, metres; K may be 0.
     normals
         (B, 3, H, W) normals to start from; unit.
     """
@@ -60,7 +61,9 @@ class CompactInputs(nn.Module):
     def __init__(self, windows: tuple[int, ...]) -> None:
         super().__init__()
         self.windows = windows
-        self.channels = 12 + 4 * len(windows)
+        self.channels = 15 + 4 * len(windows)
+        self.register_buffer("cue_scale", torch.tensor(CUE_SCALE).reshape(1, 3, 1, 1), persistent=False)
+        self.cue_scale: Tensor
 
     @torch.no_grad()
     def forward(self, frame: Frame) -> Features:
@@ -73,13 +76,17 @@ class CompactInputs(nn.Module):
             *_phasor_channels(frame.phasor),
             (frame.depth - 0.8) / 0.4,  # the rig works at 0.35 m to 1.5 m
             (frame.gap * 10).clamp(-2, 2),  # 20 MHz is noisy by centimetres
+            (frame.cues * self.cue_scale * 100).clamp(-2, 2),  # multipath costs up to some cm
             frame.valid,
             r[:, :2],
             *((s - frame.depth).mul(50).clamp(-2, 2) for s in smooth),  # noise is some mm
             *((var.sqrt() * 50).clamp(0, 2) for _, var in planes),
             *((n[:, :2]) for n in normals),
         ]
-        return Features(torch.cat(channels, 1), torch.cat(smooth, 1), normals[len(normals) // 2])
+        corrected = frame.depth - frame.cues * self.cue_scale
+        return Features(
+            torch.cat(channels, 1), torch.cat([*smooth, corrected], 1), normals[len(normals) // 2]
+        )
 
 
 def _phasor_channels(phasor: Tensor) -> list[Tensor]:
@@ -112,7 +119,7 @@ class Raw2Depth(nn.Module):
 
     def __init__(self, network: Network, channels: int) -> None:
         super().__init__()
-        self.candidates = len(network.windows) if network.kind == "compact" else 0
+        self.candidates = len(network.windows) + len(CUE_SCALE) if network.kind == "compact" else 0
         self.max_residual = network.max_residual
         self.net = _head(network, channels, self.candidates + 1 + CONVEX_CHANNELS)
         self.register_buffer("bilinear", bilinear_logits().reshape(1, -1, 1, 1), persistent=False)

@@ -54,6 +54,8 @@ class Prediction:
         Intrinsics of the (2H, 2W) grid.
     inference_ms
         Median time of the network, after loading and decoding.
+    decode_ms
+        Time of decoding the raw frame and of the physical cues, once.
     """
 
     depth: Float32
@@ -61,6 +63,7 @@ class Prediction:
     normals: Float32
     camera: Camera
     inference_ms: float
+    decode_ms: float
 
 
 def _from_npy(path: Path, rig_path: Path | None) -> RawInput:
@@ -151,7 +154,9 @@ def predict_raw(data: RawInput, frame: int | None, weights: Path | None, device:
     raw, celsius = data.raw[taken].mean(axis=0, dtype=np.float64), float(data.celsius[taken].mean())
     model, _, _ = load_model(weights)
     model.to(device)
+    started = time.perf_counter()
     inputs = frame_to(batched(make_frame(raw, data.info, data.camera, celsius)), torch.device(device))
+    decode_ms = 1000 * (time.perf_counter() - started)
     times: list[float] = []
     with torch.inference_mode():
         estimate: Estimate = model(inputs)  # the first run allocates
@@ -167,6 +172,7 @@ def predict_raw(data: RawInput, frame: int | None, weights: Path | None, device:
         normals=np.ascontiguousarray(estimate.normals[0].permute(1, 2, 0).cpu().numpy()),
         camera=data.camera.scaled(2),
         inference_ms=statistics.median(times),
+        decode_ms=decode_ms,
     )
 
 
@@ -239,6 +245,7 @@ def predict(
         "input": str(path),
         "weights": str(find_model(weights)),
         "inference_ms": round(prediction.inference_ms, 2),
+        "decode_ms": round(prediction.decode_ms, 2),
         "shape": list(prediction.depth.shape),
         "median_depth": float(np.median(prediction.depth)),
         "median_expected_error": float(np.median(prediction.error)),

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from tofcapture_model.geometry import depth_to_normals, propagate_depth, unit
 
 _MIN_ERROR = 1e-3  # m; the same floor as in eq. 1
+_GAIN_UNIT = 5.0  # gains learn at the pace of the weights of a layer, which move by much less than 1
 
 
 class Refinement(nn.Module):
@@ -44,8 +45,9 @@ class Refinement(nn.Module):
         confidence = error.detach().clamp_min(_MIN_ERROR) ** -2
         confidence = confidence / confidence.amax(dim=(2, 3), keepdim=True)
         for depth_gain, normal_gain in zip(self.depth_gain, self.normal_gain, strict=True):
-            fitted = depth_to_normals(depth, confidence, intrinsics, radius=4)
-            normals = unit(normals + normal_gain * (fitted - normals))
+            # a measurement of the present depth, not a path for gradients: those reach the depth by propagation
+            fitted = depth_to_normals(depth.detach(), confidence, intrinsics, radius=4)
+            normals = unit(normals + _GAIN_UNIT * normal_gain * (fitted - normals))
             moved = propagate_depth(depth, normals, intrinsics, confidence, self.radius, step=2)
-            depth = depth + depth_gain * (moved - depth)
+            depth = depth + _GAIN_UNIT * depth_gain * (moved - depth)
         return depth, normals

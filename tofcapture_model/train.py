@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import os
 import time
@@ -27,31 +26,11 @@ from tofcapture_model.evaluate import model_method, score
 from tofcapture_model.frame import frame_to, target_to
 from tofcapture_model.geometry import scale_intrinsics
 from tofcapture_model.joint import JointModel, build_model, select_stage
-from tofcapture_model.losses import Objective, objective
+from tofcapture_model.losses import objective
+from tofcapture_model.runlog import Log, Position
 
 SAVE_EVERY = 60.0  # s between resume points
 LOG_EVERY = 20  # steps
-
-
-@dataclass
-class Position:
-    """Where a run is; everything in it goes into the resume point.
-
-    Attributes
-    ----------
-    stage, epoch, batch
-        The next batch to take.
-    step
-        Steps done, over all stages.
-    elapsed
-        Seconds of training in this stage, over all sittings.
-    """
-
-    stage: int = 0
-    epoch: int = 0
-    batch: int = 0
-    step: int = 0
-    elapsed: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -121,6 +100,7 @@ def train(
     """
     if epochs is not None:
         config = replace(config, stages=tuple(replace(s, epochs=epochs) for s in config.stages))
+    load_manifest(dataset)  # says what is wrong with it, before anything is started
     with _processes() as (rank, world):
         place = torch.device(
             f"cuda:{os.environ['LOCAL_RANK']}" if world > 1 and torch.cuda.is_available() else device
@@ -140,7 +120,7 @@ def train(
             seed=config.training.seed,
             cache_bytes=0 if workers else 1.5e9,
         )
-        log = _Log(out if rank == 0 else None)
+        log = Log(out if rank == 0 else None)
         losses: dict[str, float] = {}
         total_epochs = sum(s.epochs for s in config.stages)
         for position.stage in range(position.stage, len(config.stages)):  # noqa: B020  the position is the loop's state
@@ -285,56 +265,3 @@ def _validate(model: JointModel, dataset: Path, place: torch.device) -> dict[str
     if not table["depth"]["pixel"]["pixels"]:
         return {}
     return {"val_mae": table["depth"]["pixel"]["mae"], "val_angle_deg": table["normal"]["pixel"]["mean_deg"]}
-
-
-class _Log:
-    """``metrics.jsonl`` always, TensorBoard where it is installed; silent for processes that are not the first."""
-
-    def __init__(self, out: Path | None) -> None:
-        self._file, self._board = None, None
-        if out is None:
-            return
-        out.mkdir(parents=True, exist_ok=True)
-        self._file = (out / "metrics.jsonl").open("a", encoding="utf-8")
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError:
-            return
-        self._board = SummaryWriter(str(out / "tensorboard"))  # type: ignore[no-untyped-call]
-
-    def _write(self, step: int, row: Mapping[str, Any]) -> None:
-        if self._file is not None:
-            self._file.write(json.dumps({"step": step, **row}) + "\n")
-            self._file.flush()
-        for name, value in row.items() if self._board is not None else ():
-            if isinstance(value, float):
-                self._board.add_scalar(name, value, step)  # type: ignore[union-attr,no-untyped-call]
-
-    def step(self, position: Position, stage: Stage, loss: Objective, rate: float) -> dict[str, float]:
-        """Log one step; return its losses."""
-        losses = {
-            "total": float(loss.total.detach()),
-            **{k: float(v.detach()) for k, v in loss.parts.items()},
-        }
-        row: dict[str, Any] = {
-            "stage": stage.name,
-            "epoch": position.epoch,
-            "seconds": position.elapsed,
-            "rate": rate,
-        }
-        if "chamfer" in losses:
-            row["winners"] = loss.winners.tolist()
-        self._write(position.step, row | losses)
-        return losses
-
-    def validation(self, position: Position, stage: Stage, values: Mapping[str, float]) -> None:
-        """Log a validation."""
-        if values:
-            self._write(position.step, {"stage": stage.name, "epoch": position.epoch, **values})
-
-    def close(self) -> None:
-        """Close the files."""
-        if self._file is not None:
-            self._file.close()
-        if self._board is not None:
-            self._board.close()  # type: ignore[no-untyped-call]

@@ -14,7 +14,7 @@ from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, TofMaps
 from tofcapture.frames import TofBurst, TofInfo, View
 from tofcapture.ops.crop import Crop, find_crop, inside
 from tofcapture.ops.denoise import denoise
-from tofcapture.ops.normals import normals_from_depth
+from tofcapture.ops.normals import NormalField, grazing
 from tofcapture.ops.phase import decode, mean_phasors
 from tofcapture.ops.project import Projection, project, triangulate
 from tofcapture.ops.register import register
@@ -34,13 +34,10 @@ class SampleConfig:
         Largest distance of the object from the point the ToF camera looks at, along the table, metres.
     far
         Largest depth of ground truth in the ToF frame, metres.
-    normal_radius
-        Windows of native normals are ``2 normal_radius + 1`` stereo pixels wide.
     """
 
     crop_radius: float = 0.35
     far: float = 2.0
-    normal_radius: int = 4
 
 
 def make_sample(view: View, rig: Rig, config: SampleConfig, rng: np.random.Generator) -> Sample:
@@ -72,20 +69,20 @@ def make_sample(view: View, rig: Rig, config: SampleConfig, rng: np.random.Gener
     native = np.where(denoise(measured, rig.stereo), measured, np.nan)
     sheet = triangulate(native, rig.stereo)
     points = register(rig.stereo.unproject(sheet.depth), rig.T_tof_stereo, config.far)
-    normals = native_normals(np.where(sheet.vertex, sheet.depth, np.nan), rig, config.normal_radius)
-    on_surface = np.where(np.isfinite(native)[..., None], points, np.nan)
-    crop = find_crop(on_surface, rng, config.crop_radius, config.far)
-    truths = {
-        scale: assemble(
-            project(sheet, points, normals, rig.T_tof_stereo[:3, 3], rig.tof.scaled(scale), edge_pixels=scale),
-            rig.tof.scaled(scale),
-            crop,
+    field = NormalField(np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
+    measured_points = np.where(np.isfinite(native)[..., None], points, np.nan)
+    crop = find_crop(measured_points, rng, config.crop_radius, config.far)
+    truths = {}
+    for scale in SCALES:
+        camera = rig.tof.scaled(scale)
+        projection = project(sheet, points, camera, edge_pixels=scale)
+        truths[scale] = assemble(
+            projection, smooth_normals(projection, field, rig, camera), rig, camera, crop
         )
-        for scale in SCALES
-    }
     if all((truth.mask & MaskBit.NOT_HIT).all() for truth in truths.values()):
         raise DataError(
-            f"{view.scene} view {view.index}: stereo measured nothing in the ToF camera's view", hint="check the rig"
+            f"{view.scene} view {view.index}: stereo measured nothing in the ToF camera's view",
+            hint="check the rig",
         )
     return Sample(
         index=view.index,
@@ -93,7 +90,7 @@ def make_sample(view: View, rig: Rig, config: SampleConfig, rng: np.random.Gener
         celsius=np.asarray(view.tof.celsius, dtype=np.float64),
         time_ns=np.asarray(view.tof.time_ns, dtype=np.int64),
         tof=tof,
-        native_depth=np.where(inside(crop, on_surface), native, np.nan).astype(np.float32),
+        native_depth=np.where(inside(crop, measured_points), native, np.nan).astype(np.float32),
         ground_truth=truths,
         T_base_tof=view.arm_before.T_base_flange @ rig.T_flange_tof,
         truth=None if view.truth is None else ExactMaps(view.truth.depth, view.truth.normals),
@@ -122,7 +119,7 @@ def calibrated(info: TofInfo, rig: Rig) -> TofInfo:
 
 def decode_burst(burst: TofBurst, info: TofInfo) -> TofMaps:
     """Average a burst as I and Q, decode it to depth."""
-    saturated = (burst.raw >= info.saturation).any(axis=(0, 1))
+    saturated: NDArray[np.bool_] = np.any(burst.raw >= info.saturation, axis=(0, 1))
     decoded = decode(
         mean_phasors(burst.raw, info.modulation_hz, info.phase_rad),
         info.modulation_hz,
@@ -136,22 +133,27 @@ def decode_burst(burst: TofBurst, info: TofInfo) -> TofMaps:
     return TofMaps(depth.astype(np.float32), decoded.confidence.astype(np.float32), saturated)
 
 
-def native_normals(depth: Float64, rig: Rig, radius: int) -> Float64:
-    """(SH, SW, 3) normals of the stereo sheet, in the ToF frame."""
-    return rotate_vectors(rig.T_tof_stereo, normals_from_depth(depth, rig.stereo, radius))
+def smooth_normals(projection: Projection, field: NormalField, rig: Rig, camera: Camera) -> Float64:
+    """(H, W, 3) normals of the surface that is met, ToF frame, facing the ToF camera; a triangle's own where no fit does."""
+    hit = np.isfinite(projection.depth)
+    fitted = rotate_vectors(rig.T_tof_stereo, field.at(projection.pixels[hit]))
+    usable = np.einsum("nc,nc->n", fitted, camera.rays[hit]) < 0  # NaN compares false
+    out = projection.normals.copy()
+    out[hit] = np.where(usable[:, None], fitted, out[hit])
+    return out
 
 
-def assemble(projection: Projection, camera: Camera, crop: Crop) -> GroundTruth:
-    """Put a projection's reasons for mistrust into the bits of one mask."""
-    missing = ~np.isfinite(projection.depth)
+def assemble(projection: Projection, normals: Float64, rig: Rig, camera: Camera, crop: Crop) -> GroundTruth:
+    """Put every reason for mistrust into the bits of one mask."""
+    points = camera.unproject(projection.depth)
     bits: tuple[tuple[MaskBit, NDArray[np.bool_]], ...] = (
-        (MaskBit.NOT_HIT, missing),
+        (MaskBit.NOT_HIT, ~np.isfinite(projection.depth)),
         (MaskBit.OCCLUDED, projection.occluded),
-        (MaskBit.GRAZING, projection.grazing),
+        (MaskBit.GRAZING, grazing(points, normals, (np.zeros(3), rig.T_tof_stereo[:3, 3]))),
         (MaskBit.EDGE, projection.edge),
-        (MaskBit.OUTSIDE, ~inside(crop, camera.unproject(projection.depth))),
+        (MaskBit.OUTSIDE, ~inside(crop, points)),
     )
     mask = np.zeros(camera.shape, dtype=np.uint8)
     for bit, where in bits:
         mask[where] |= np.uint8(bit)
-    return GroundTruth(projection.depth.astype(np.float32), projection.normals.astype(np.float32), mask)
+    return GroundTruth(projection.depth.astype(np.float32), normals.astype(np.float32), mask)

@@ -72,7 +72,9 @@ def load_driver(name: str) -> Mapping[str, Factory]:
     except Exception as err:
         raise ConfigError(f"driver {name!r} ({found[name].value}) does not import: {err}") from err
     if not isinstance(drivers, Mapping) or not drivers or not set(drivers) <= set(ROLES):
-        raise ConfigError(f"driver {name!r} ({found[name].value}): expected a mapping of roles {ROLES} to factories")
+        raise ConfigError(
+            f"driver {name!r} ({found[name].value}): expected a mapping of roles {ROLES} to factories"
+        )
     return drivers
 
 
@@ -86,9 +88,11 @@ def make_device(role: str, context: StationContext) -> Any:
     """
     table = context.config.get(role)
     if not isinstance(table, Mapping) or not isinstance(table.get("driver"), str):
-        raise ConfigError(f"station: expected a table [{role}] with driver = \"name\", got {table!r}")
+        raise ConfigError(f'station: expected a table [{role}] with driver = "name", got {table!r}')
     name = table["driver"]
     drivers = load_driver(name)
     if role not in drivers:
-        raise ConfigError(f"[{role}] driver {name!r}: expected a driver for {role}, it has {', '.join(sorted(drivers))}")
+        raise ConfigError(
+            f"[{role}] driver {name!r}: expected a driver for {role}, it has {', '.join(sorted(drivers))}"
+        )
     return drivers[role]({k: v for k, v in table.items() if k != "driver"}, context)

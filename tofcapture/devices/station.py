@@ -85,12 +85,20 @@ def read_station(path: Path | None, seed: int | None = None) -> dict[str, Any]:
     try:
         config = tomllib.loads(where.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
-        raise ConfigError(f"{where}: cannot read the station: {err}", hint="leave --station out for the simulated one") from err
+        raise ConfigError(
+            f"{where}: cannot read the station: {err}", hint="leave --station out for the simulated one"
+        ) from err
     wrong = [key for key, table in config.items() if key not in _TABLES or not isinstance(table, Mapping)]
     if wrong:
-        raise ConfigError(f"{where}: expected the tables {', '.join(_TABLES)}, got {', '.join(wrong)}")
+        raise ConfigError(
+            f"{where}: expected the tables {', '.join(_TABLES)}, got {', '.join(wrong)}",
+            hint=f"compare with {DEFAULT}",
+        )
     if seed is not None:
         config["sim"] = {**config.get("sim", {}), "seed": seed}
+    found = config.get("sim", {}).get("seed", 0)
+    if not isinstance(found, int) or found < 0:
+        raise ConfigError(f"{where}: [sim] seed: expected a whole number from 0 on, got {found!r}")
     return config
 
 
@@ -158,5 +166,6 @@ def _rig(context: StationContext) -> Rig:
         rig: Rig = context.shared["sim"].nominal_rig()
         return rig
     raise ConfigError(
-        'station: expected [rig] path = "rig.toml"', hint="the bracket's drawing does for a start; see docs/formats.md"
+        'station: expected [rig] path = "rig.toml"',
+        hint="the bracket's drawing does for a start; see docs/formats.md",
     )

@@ -17,7 +17,9 @@ from tofcapture.files.layout import Field, Layout
 Array = NDArray[Any]
 
 
-def create(file: h5py.File, field: Field, shape: tuple[int, ...], dtype: str | np.dtype[Any], gzip: int) -> h5py.Dataset:
+def create(
+    file: h5py.File, field: Field, shape: tuple[int, ...], dtype: str | np.dtype[Any], gzip: int
+) -> h5py.Dataset:
     """Create a field's dataset; the same calls give the same bytes (no time stamps).
 
     Parameters
@@ -36,7 +38,13 @@ def create(file: h5py.File, field: Field, shape: tuple[int, ...], dtype: str | n
     storage: dict[str, Any] = {}
     if field.chunk is not None:
         chunks = (1,) * field.chunk + shape[field.chunk :]
-        storage = {"chunks": chunks, "shuffle": True, "compression": "gzip", "compression_opts": gzip, "fletcher32": True}
+        storage = {
+            "chunks": chunks,
+            "shuffle": True,
+            "compression": "gzip",
+            "compression_opts": gzip,
+            "fletcher32": True,
+        }
     dataset = file.create_dataset(field.path, shape, dtype, track_times=False, **storage)
     dataset.attrs["units"] = field.units
     dataset.attrs["description"] = field.doc
@@ -94,7 +102,9 @@ def _check_format(file: h5py.File, path: Path, layout: Layout) -> None:
     if version != layout.version:
         raise FormatError(
             f"{path}: expected {layout.format} version {layout.version}, got {version}",
-            hint="a newer tofcapture wrote it: upgrade" if version > layout.version else "convert it or record it again",
+            hint="a newer tofcapture wrote it: upgrade"
+            if version > layout.version
+            else "convert it or record it again",
         )
 
 
@@ -136,7 +146,9 @@ def fetch(file: h5py.File, field: Field, path: Path) -> Array:
     if not isinstance(dataset, h5py.Dataset):
         raise FormatError(f"{path}: expected the dataset /{field.path}, found none")
     if dataset.dtype.name not in field.dtypes:
-        raise FormatError(f"{path}: /{field.path}: expected {' or '.join(field.dtypes)}, got {dataset.dtype.name}")
+        raise FormatError(
+            f"{path}: /{field.path}: expected {' or '.join(field.dtypes)}, got {dataset.dtype.name}"
+        )
     try:
         return np.asarray(dataset[()])
     except (OSError, RuntimeError, ValueError) as err:

@@ -1,7 +1,7 @@
 """The formats as data: what a view file and a shard hold, and what it means.
 
 Writers create what is listed here, readers fetch it, :mod:`tofcapture.files.check` compares a file with it and
-``python -m tofcapture.files.layout > docs/formats.md`` prints it. Changing a layout means raising its version.
+``python -m tofcapture.files.page > docs/formats.md`` prints it. Changing a layout means raising its version.
 """
 
 from __future__ import annotations
@@ -15,18 +15,22 @@ SPLITS = ("train", "val", "test")
 
 
 class MaskBit(IntFlag):
-    """Why a ground-truth pixel should not be trusted; 0 is good ground truth."""
+    """Why a ground-truth pixel should not be trusted; 0 is good ground truth. :data:`MASK_DOCS` says what each means."""
 
     NOT_HIT = 1
-    """The ray hits no measured surface; depth and normal are NaN."""
     OCCLUDED = 2
-    """The ray crosses space that the stereo camera could not see before it hits."""
     GRAZING = 4
-    """The surface is seen at more than 75 degrees from its normal by either camera."""
     EDGE = 8
-    """Within a (low-resolution) pixel of a depth edge or of a pixel that is not hit."""
     OUTSIDE = 16
-    """Outside the crop around the scene's object: table and background."""
+
+
+MASK_DOCS = {
+    MaskBit.NOT_HIT: "the ray hits no measured surface; depth and normal are NaN, elsewhere they are finite",
+    MaskBit.OCCLUDED: "the ray crosses space that the stereo camera could not see before it hits",
+    MaskBit.GRAZING: "the surface is seen at more than 75 degrees from its normal by either camera",
+    MaskBit.EDGE: "within one pixel of the 1x grid of a depth edge or of a pixel that is not hit",
+    MaskBit.OUTSIDE: "outside the crop around the scene's object: table and background",
+}
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,11 @@ def _size(dim: str, sizes: Mapping[str, int]) -> int:
 _DESCRIPTION_ATTRS = (
     ("units", "text", 'always "m"; seconds, radians and hertz elsewhere'),
     ("rig", "TOML", "the rig, see rig.toml below"),
-    ("tof_info", "JSON", "model, serial, intrinsics, illuminator, modulation_hz, phase_rad, exposure, saturation, range_errors"),
+    (
+        "tof_info",
+        "JSON",
+        "model, serial, intrinsics, illuminator, modulation_hz, phase_rad, exposure, saturation, range_errors",
+    ),
     ("stereo_info", "JSON", "model, serial, intrinsics of the point map's grid"),
     ("provenance", "JSON", "versions, digests of inputs, seeds, UTC time"),
 )
@@ -113,15 +121,45 @@ VIEW = Layout(
     version=1,
     title="View file `RECORDING/views/<scene>/view-007.h5`",
     fields=(
-        Field("tof/raw", _RAW, ("F", "K", "H", "W"), "DN", "phase images of the static burst, as the sensor gave them", 1),
+        Field(
+            "tof/raw",
+            _RAW,
+            ("F", "K", "H", "W"),
+            "DN",
+            "phase images of the static burst, as the sensor gave them",
+            1,
+        ),
         Field("tof/time_ns", _I64, ("F",), "ns", "monotonic clock"),
         Field("tof/celsius", _F64, ("F",), "degC", "sensor temperature; NaN: not told"),
-        Field("stereo/points", _F32, ("SH", "SW", "3"), "m", "organised point map, stereo frame; NaN: not measured", 0),
+        Field(
+            "stereo/points",
+            _F32,
+            ("SH", "SW", "3"),
+            "m",
+            "organised point map, stereo frame; NaN: not measured",
+            0,
+        ),
         Field("stereo/time_ns", _I64, (), "ns", "monotonic clock"),
         *_arm("before"),
         *_arm("after"),
-        Field("truth/depth", _F32, ("2H", "2W"), "m", "exact depth on the ToF plane at 2x; NaN: nothing there", 0, optional=True),
-        Field("truth/normals", _F32, ("2H", "2W", "3"), "1", "exact geometric normals, ToF frame, facing the camera", 0, optional=True),
+        Field(
+            "truth/depth",
+            _F32,
+            ("2H", "2W"),
+            "m",
+            "exact depth on the ToF plane at 2x; NaN: nothing there",
+            0,
+            optional=True,
+        ),
+        Field(
+            "truth/normals",
+            _F32,
+            ("2H", "2W", "3"),
+            "1",
+            "exact geometric normals, ToF frame, facing the camera",
+            0,
+            optional=True,
+        ),
         Field("truth/target", _BOOL, ("2H", "2W"), "1", "the ray hits the scene's object", 0, optional=True),
         Field("truth/T_tof_stereo", _F64, ("4", "4"), "m", "stereo to ToF of the true rig", optional=True),
         Field("truth/T_flange_tof", _F64, ("4", "4"), "m", "ToF to flange of the true rig", optional=True),
@@ -140,9 +178,25 @@ def _projected(scale: int) -> tuple[Field, ...]:
     s = "" if scale == 1 else str(scale)
     H, W = f"{s}H", f"{s}W"
     return (
-        Field(f"gt/depth_{scale}x", _F32, ("N", H, W), "m", f"ground-truth depth on the ToF plane at {scale}x; NaN: not hit", 1),
-        Field(f"gt/normals_{scale}x", _F32, ("N", H, W, "3"), "1", "ground-truth normals, ToF frame, unit, facing the camera", 1),
-        Field(f"gt/mask_{scale}x", ("uint8",), ("N", H, W), "1", "mask bits, see below; 0: good ground truth", 1),
+        Field(
+            f"gt/depth_{scale}x",
+            _F32,
+            ("N", H, W),
+            "m",
+            f"ground-truth depth on the ToF plane at {scale}x; NaN: not hit",
+            1,
+        ),
+        Field(
+            f"gt/normals_{scale}x",
+            _F32,
+            ("N", H, W, "3"),
+            "1",
+            "ground-truth normals, ToF frame, unit, facing the camera",
+            1,
+        ),
+        Field(
+            f"gt/mask_{scale}x", ("uint8",), ("N", H, W), "1", "mask bits, see below; 0: good ground truth", 1
+        ),
     )
 
 
@@ -154,16 +208,54 @@ SHARD = Layout(
         Field("tof/raw", _RAW, ("N", "F", "K", "H", "W"), "DN", "phase images, as the sensor gave them", 2),
         Field("tof/celsius", _F64, ("N", "F"), "degC", "sensor temperature; NaN: not told"),
         Field("tof/time_ns", _I64, ("N", "F"), "ns", "monotonic clock"),
-        Field("tof/depth", _F32, ("N", "H", "W"), "m", "depth decoded from the burst's mean I and Q; NaN: none", 1),
-        Field("tof/confidence", _F32, ("N", "H", "W"), "DN", "amplitude of the highest frequency, burst mean", 1),
+        Field(
+            "tof/depth",
+            _F32,
+            ("N", "H", "W"),
+            "m",
+            "depth decoded from the burst's mean I and Q; NaN: none",
+            1,
+        ),
+        Field(
+            "tof/confidence", _F32, ("N", "H", "W"), "DN", "amplitude of the highest frequency, burst mean", 1
+        ),
         Field("tof/saturated", _BOOL, ("N", "H", "W"), "1", "a tap of a frame reached saturation", 1),
-        Field("gt/native_depth", _F32, ("N", "SH", "SW"), "m", "cropped and denoised stereo depth (z), stereo frame; NaN: none", 1),
+        Field(
+            "gt/native_depth",
+            _F32,
+            ("N", "SH", "SW"),
+            "m",
+            "cropped and denoised stereo depth (z), stereo frame; NaN: none",
+            1,
+        ),
         *_projected(1),
         *_projected(2),
-        Field("views/T_base_tof", _F64, ("N", "4", "4"), "m", "ToF to base, from the measured joints and the rig"),
+        Field(
+            "views/T_base_tof",
+            _F64,
+            ("N", "4", "4"),
+            "m",
+            "ToF to base, from the measured joints and the rig",
+        ),
         Field("views/index", _I64, ("N",), "1", "number of the view in its recording"),
-        Field("truth/depth_2x", _F32, ("N", "2H", "2W"), "m", "exact depth at 2x (simulated recordings)", 1, optional=True),
-        Field("truth/normals_2x", _F32, ("N", "2H", "2W", "3"), "1", "exact normals at 2x (simulated recordings)", 1, optional=True),
+        Field(
+            "truth/depth_2x",
+            _F32,
+            ("N", "2H", "2W"),
+            "m",
+            "exact depth at 2x (simulated recordings)",
+            1,
+            optional=True,
+        ),
+        Field(
+            "truth/normals_2x",
+            _F32,
+            ("N", "2H", "2W", "3"),
+            "1",
+            "exact normals at 2x (simulated recordings)",
+            1,
+            optional=True,
+        ),
     ),
     attrs=(
         ("format", "text", "`tofcapture-shard`"),
@@ -174,80 +266,3 @@ SHARD = Layout(
 )
 
 LAYOUTS = {layout.format: layout for layout in (VIEW, SHARD)}
-
-_INTRODUCTION = """\
-# Formats
-
-Generated by `python -m tofcapture.files.layout > docs/formats.md`; a test fails when this page is stale.
-
-Everything is metres, seconds, radians, hertz; the attribute `units` of each dataset says so. No measurement is NaN, zero
-never means missing. `T_a_b` maps points of frame b into frame a. Camera frames: x right, y down, z forward. `depth` is z.
-Sizes: `N` views, `F` frames of a burst, `K` raw channels, `H W` ToF image, `SH SW` stereo grid.
-
-Every HDF5 file opens with plain h5py (gzip, shuffle, Fletcher-32). It is written once under the name `*.partial`, verified,
-fsynced, made read-only and renamed; the file `NAME.sha256` beside it holds the digest of all its bytes
-(`sha256sum -c NAME.sha256`). `tofcapture check PATH` lists every problem of a file, a recording or a dataset.
-"""
-
-_OTHERS = """\
-## `DATASET/manifest.json`
-
-`{"format": "tofcapture-manifest", "version": 1, "scenes": {NAME: {"path", "sha256", "views", "split"}}, "config": {...},
-"versions": {...}}`; `path` is relative to the dataset, `split` is train, val or test. Scenes of one object (the name up to a
-trailing `-<digits>`) are always in the same split.
-
-## `rig.toml`
-
-`format = "tofcapture-rig"`, `version = 1`, `units = "m"`; tables `[tof]` (width, height, fx, fy, cx, cy, illuminator) and
-`[stereo]` (width, height, fx, fy, cx, cy); `T_tof_stereo` and `T_flange_tof` as 4 x 4 lists; any number of `[[range_error]]`
-(modulation_hz, offset, scale, harmonics as `[order, cosine, sine]`, per_pixel_radius, per_kelvin, reference_celsius).
-"""
-
-
-def _section(layout: Layout) -> str:
-    rows = [
-        f"| `/{f.path}` | {' or '.join(f.dtypes)} | {' x '.join(f.dims) or 'scalar'} | {f.units} | {f.doc}"
-        + (" (optional)" if f.optional else "")
-        + " |"
-        for f in layout
-    ]
-    attrs = [f"| `{name}` | {kind} | {doc} |" for name, kind, doc in layout.attrs]
-    return "\n".join(
-        [
-            f"## {layout.title}",
-            "",
-            f"`format = \"{layout.format}\"`, `version = {layout.version}`.",
-            "",
-            "| dataset | dtype | shape | units | meaning |",
-            "|---|---|---|---|---|",
-            *rows,
-            "",
-            "| attribute | kind | meaning |",
-            "|---|---|---|",
-            *attrs,
-            "",
-        ]
-    )
-
-
-_MASK_DOCS = {
-    MaskBit.NOT_HIT: "the ray hits no measured surface; depth and normal are NaN, elsewhere they are finite",
-    MaskBit.OCCLUDED: "the ray crosses space that the stereo camera could not see before it hits",
-    MaskBit.GRAZING: "the surface is seen at more than 75 degrees from its normal by either camera",
-    MaskBit.EDGE: "within one pixel of the 1x grid of a depth edge or of a pixel that is not hit",
-    MaskBit.OUTSIDE: "outside the crop around the scene's object: table and background",
-}
-
-
-def _mask_section() -> str:
-    rows = [f"| {bit.value} | `{bit.name}` | {doc} |" for bit, doc in _MASK_DOCS.items()]
-    return "\n".join(["## Mask bits of `/gt/mask_*`", "", "| bit | name | meaning |", "|---|---|---|", *rows, ""])
-
-
-def formats_markdown() -> str:
-    """Text of ``docs/formats.md``."""
-    return "\n".join([_INTRODUCTION, _section(VIEW), _section(SHARD), _mask_section(), _OTHERS])
-
-
-if __name__ == "__main__":
-    print(formats_markdown(), end="")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -13,6 +14,13 @@ from tofcapture.files.layout import SPLITS
 from tofcapture.files.seal import write_text
 
 FORMAT, VERSION = "tofcapture-manifest", 1
+COMBINATIONS = ("random",)  # every number is another combination of objects
+
+
+def object_of(scene: str) -> str:
+    """Object of a scene: its name up to a trailing ``-<digits>`` (``mug``, ``mug-2`` are one; ``random-1`` is its own)."""
+    stem = re.sub(r"-\d+$", "", scene)
+    return scene if stem in COMBINATIONS else stem
 
 
 @dataclass(frozen=True)
@@ -90,7 +98,8 @@ def load_manifest(dataset: Path) -> Manifest:
         table = json.loads(path.read_text(encoding="utf-8"))
     except OSError as err:
         raise DataError(
-            f"{path}: cannot read the dataset's manifest: {err}", hint="tofcapture build-dataset RECORDING --out DIR"
+            f"{path}: cannot read the dataset's manifest: {err}",
+            hint="tofcapture build-dataset RECORDING --out DIR",
         ) from err
     except ValueError as err:
         raise DataError(f"{path}: not JSON: {err}", hint="run build-dataset again") from err

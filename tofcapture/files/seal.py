@@ -43,25 +43,26 @@ def stored_digest(path: Path) -> str | None:
     return words[0] if words else None
 
 
-def verify_digest(path: Path) -> str:
-    """Hash a sealed file and compare with its stored digest.
+def sealed_digest(path: Path) -> str:
+    """Hash a file and make sure that it is what was sealed.
 
     Returns
     -------
-    The digest.
+    SHA-256 of its bytes; without a stored digest there is nothing to compare with.
 
     Raises
     ------
     DataError
-        When there is no stored digest or the bytes are not those that were sealed.
+        When the file cannot be read, or its bytes are not those that were sealed.
     """
     stored = stored_digest(path)
-    if stored is None:
-        raise DataError(f"{path}: expected its digest in {digest_path(path).name}", hint="record or build it again")
-    found = sha256_of(path)
-    if found != stored:
+    try:
+        found = sha256_of(path)
+    except OSError as err:
+        raise DataError(f"{path}: cannot be read: {err}") from err
+    if stored not in (None, found):
         raise DataError(
-            f"{path}: expected sha256 {stored[:12]}..., got {found[:12]}...: the file was changed after it was sealed",
+            f"{path}: expected sha256 {str(stored)[:12]}..., got {found[:12]}...: changed after it was sealed",
             hint="restore it from a copy, or delete it and run the same command again",
         )
     return found

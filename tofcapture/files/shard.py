@@ -171,13 +171,18 @@ class ShardReader:
 
     def _row(self, name: str, *index: int) -> Array:
         dataset = self._dataset(name)
-        if not (0 <= index[0] < dataset.shape[0] and all(0 <= i < n for i, n in zip(index, dataset.shape, strict=False))):
+        if not (
+            0 <= index[0] < dataset.shape[0]
+            and all(0 <= i < n for i, n in zip(index, dataset.shape, strict=False))
+        ):
             raise DataError(f"{self.path}: /{name} has shape {dataset.shape}, asked for {index}")
         try:
             return np.asarray(dataset[index])
         except (OSError, RuntimeError) as err:
             where = f"/{name}{list(index)}"
-            raise DataError(f"{self.path}: {where} is damaged: {err}", hint=f"tofcapture check {self.path}") from err
+            raise DataError(
+                f"{self.path}: {where} is damaged: {err}", hint=f"tofcapture check {self.path}"
+            ) from err
 
     @cached_property
     def scene(self) -> str:

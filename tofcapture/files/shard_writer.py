@@ -112,12 +112,16 @@ class ShardWriter:
         if not self._added:
             self._create(self._file, rows)
         if rows.keys() != self._digests.keys():
-            raise FormatError(f"{self._path}: samples disagree on {sorted(rows.keys() ^ self._digests.keys())}")
+            raise FormatError(
+                f"{self._path}: samples disagree on {sorted(rows.keys() ^ self._digests.keys())}"
+            )
         for name, row in rows.items():
             dataset = self._file[name]
             if row.shape != dataset.shape[1:] or row.dtype != dataset.dtype:
                 got = f"{row.dtype} {row.shape}"
-                raise FormatError(f"/{name}: expected {dataset.dtype} {dataset.shape[1:]} per view, got {got}")
+                raise FormatError(
+                    f"/{name}: expected {dataset.dtype} {dataset.shape[1:]} per view, got {got}"
+                )
             dataset[self._added] = row
             self._digests[name].update(row.tobytes())
         self._added += 1

@@ -37,7 +37,8 @@ def check_scene_name(scene: str) -> str:
     """
     if not _SCENE.fullmatch(scene):
         raise ConfigError(
-            f"scene: expected 1 to 64 letters, digits, '_', '.' or '-', got {scene!r}", hint="for example: --scene mug-2"
+            f"scene: expected 1 to 64 letters, digits, '_', '.' or '-', got {scene!r}",
+            hint="for example: --scene mug-2",
         )
     return scene
 
@@ -81,7 +82,9 @@ def _verify(path: Path, arrays: dict[str, Array]) -> None:
     with open_checked(path, VIEW) as file:
         for name, data in arrays.items():
             if fetch(file, VIEW[name], path).tobytes() != data.tobytes():
-                raise DataError(f"{path}: /{name} read back differs from what was written", hint="check the disk")
+                raise DataError(
+                    f"{path}: /{name} read back differs from what was written", hint="check the disk"
+                )
 
 
 def write_view(path: Path, view: View) -> str:
@@ -156,7 +159,9 @@ def _read(file: h5py.File, path: Path) -> View:
         return fetch(file, VIEW[name], path)
 
     def arm(when: str) -> ArmState:
-        return ArmState(get(f"arm/{when}/joints"), get(f"arm/{when}/T_base_flange"), int(get(f"arm/{when}/time_ns")))
+        return ArmState(
+            get(f"arm/{when}/joints"), get(f"arm/{when}/T_base_flange"), int(get(f"arm/{when}/time_ns"))
+        )
 
     tof_info = tof_from(json_attr(file, "tof_info", path), str(path))
     stereo_info = stereo_from(json_attr(file, "stereo_info", path), str(path))

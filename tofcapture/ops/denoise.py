@@ -1,8 +1,7 @@
 """Take veil points, speckles and spikes out of a stereo depth image, on its grid.
 
-Stereo is dense and clean inside surfaces and wrong at their borders: matches there mix foreground and background. Three
-rules, each a count over a 5 x 5 window: a point needs neighbours on its own surface, must not stick out of it, and must
-not touch a jump.
+Stereo is dense and clean inside surfaces and wrong at their borders: matches there mix foreground and background. Two
+rules over a 5 x 5 window: a point needs neighbours on its own surface, and must not stick out of it.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ def _half_window() -> Iterator[tuple[int, int]]:
     return ((dv, du) for dv in range(3) for du in range(-2, 3) if (dv, du) > (0, 0))
 
 
-def _shift(image: NDArray[np.generic], dv: int, du: int, fill: float) -> NDArray[np.generic]:
-    """``out[v, u] = image[v + dv, u + du]``."""
-    out = np.full_like(image, fill)
+def _shift(image: Float32, dv: int, du: int) -> Float32:
+    """``out[v, u] = image[v + dv, u + du]``, NaN from outside."""
+    out = np.full_like(image, np.nan)
     height, width = image.shape
     out[max(0, -dv) : height - max(0, dv), max(0, -du) : width - max(0, du)] = image[
         max(0, dv) : height - max(0, -dv), max(0, du) : width - max(0, -du)
@@ -39,14 +38,11 @@ def _shift(image: NDArray[np.generic], dv: int, du: int, fill: float) -> NDArray
     return out
 
 
-def _window_counts(depth: Float32, step: Float32) -> tuple[Float32, Float32, Bool]:
-    """Supporting neighbours, mean of opposite pairs (inverse depth), and whether a direct neighbour is across a jump."""
-    support = np.zeros(depth.shape, np.float32)
-    pairs = np.zeros(depth.shape, np.float32)
-    total = np.zeros(depth.shape, np.float32)
-    jump = np.zeros(depth.shape, bool)
+def _window(depth: Float32, step: Float32) -> tuple[Float32, Float32]:
+    """Count supporting neighbours, and average opposite pairs of them in inverse depth (0: no pair)."""
+    support, pairs, total = (np.zeros(depth.shape, np.float32) for _ in range(3))
     for dv, du in _half_window():
-        ahead, behind = _shift(depth, dv, du, np.nan), _shift(depth, -dv, -du, np.nan)
+        ahead, behind = _shift(depth, dv, du), _shift(depth, -dv, -du)
         limit = step * np.float32(np.hypot(dv, du))
         near_a, near_b = np.abs(ahead - depth) <= limit, np.abs(behind - depth) <= limit
         support += near_a
@@ -54,9 +50,7 @@ def _window_counts(depth: Float32, step: Float32) -> tuple[Float32, Float32, Boo
         both = near_a & near_b
         total += np.where(both, 1 / ahead + 1 / behind, 0)
         pairs += both
-        if max(dv, abs(du)) == 1:
-            jump |= (np.abs(ahead - depth) > limit) | (np.abs(behind - depth) > limit)
-    return support, total / (2 * np.maximum(pairs, 1)), jump & (pairs >= 0)
+    return support, total / (2 * np.maximum(pairs, 1))
 
 
 def denoise(depth: NDArray[np.floating], camera: Camera) -> Bool:
@@ -83,7 +77,7 @@ def denoise(depth: NDArray[np.floating], camera: Camera) -> Bool:
     z = np.asarray(depth, dtype=np.float32)
     footprint = z / np.float32(min(camera.fx, camera.fy))
     with np.errstate(invalid="ignore", divide="ignore"):
-        support, smooth, jump = _window_counts(z, np.float32(STEEPEST) * footprint)
+        support, smooth = _window(z, np.float32(STEEPEST) * footprint)
         deviation = np.where(smooth > 0, np.abs(smooth * z - 1) * z, 0)
         keep = support >= SUPPORT
     if not keep.any():

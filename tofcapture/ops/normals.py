@@ -7,6 +7,8 @@ and without gating its sums are box filters.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,52 +16,65 @@ from tofcapture.camera import Camera
 from tofcapture.errors import DataError
 
 Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
-_MIN_SPREAD = 1e-4  # smallest share of the window's spread across its thinnest direction; below, the plane may swivel
+RADII = (2, 4, 8, 12)  # pixels, windows that normals_at chooses from
+TOLERANCE = 2.0  # a window is flat while its residual is below this many times the median of such windows
+GRAZING_COSINE = 0.25882  # cos 75 deg
+_MIN_SPREAD = 1e-4  # det / trace^2 of the window's rays; below, they are a line and the plane may swivel
 
 
 def _moments(depth: NDArray[np.floating], camera: Camera) -> Float64:
-    """Regression terms (9, H, W) of each pixel: 1, x, y, xx, xy, yy, q, xq, yq with q = 1 / depth; zero where NaN."""
+    """Regression terms (H, W, 10): 1, x, y, xx, xy, yy, q, xq, yq, qq with q = 1 / depth; zero where NaN."""
     if depth.shape != camera.shape:
         raise DataError(f"normals: expected depth of shape {camera.shape}, got {depth.shape}")
     valid = np.isfinite(depth) & (depth > 0)
     q = np.divide(1.0, depth, out=np.zeros(camera.shape), where=valid, dtype=np.float64)
     x = camera.rays[..., 0] * valid
     y = camera.rays[..., 1] * valid
-    return np.stack([valid.astype(np.float64), x, y, x * x, x * y, y * y, q, x * q, y * q])
+    out = np.empty((*camera.shape, 10))
+    for k, term in enumerate((valid, x, y, x * x, x * y, y * y, q, x * q, y * q, q * q)):
+        out[..., k] = term
+    return out
 
 
 def _box(values: Float64, radius: int) -> Float64:
-    """Sum over a (2 radius + 1)^2 window along the last two axes, zero outside the image."""
-    for axis in (-1, -2):
+    """Sum over a (2 radius + 1)^2 window along the first two axes, zero outside the image."""
+    for axis in (0, 1):
         pad = [(0, 0)] * values.ndim
         pad[axis] = (radius + 1, radius)
         total = np.cumsum(np.pad(values, pad), axis=axis)
         size = values.shape[axis]
-        values = np.take(total, range(2 * radius + 1, 2 * radius + 1 + size), axis) - np.take(total, range(size), axis)
+        # Differences along one axis at a time: those of a two-dimensional integral image would cost digits.
+        values = np.take(total, range(2 * radius + 1, 2 * radius + 1 + size), axis) - np.take(
+            total, range(size), axis
+        )
     return values
 
 
-def _solve(sums: Float64, depth: NDArray[np.floating]) -> Float64:
-    """Camera-facing unit normals (H, W, 3) of the accumulated moments; NaN where they determine no plane."""
+def _fit(sums: Float64) -> tuple[Float64, Float64]:
+    """Fit planes to accumulated moments (..., 10).
+
+    Returns camera-facing unit normals (..., 3), NaN where they are not determined, and the residual standard deviation of
+    inverse depth (...).
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean = sums / sums[0]
-        _, x, y, xx, xy, yy, q, xq, yq = mean
-        cxx, cxy, cyy = xx - x * x, xy - x * y, yy - y * y
-        cxq, cyq = xq - x * q, yq - y * q
-        det, trace = cxx * cyy - cxy * cxy, cxx + cyy
-        m = np.stack([cyy * cxq - cxy * cyq, cxx * cyq - cxy * cxq, np.zeros_like(det)], axis=-1) / det[..., None]
-        m[..., 2] = q - m[..., 0] * x - m[..., 1] * y
+        n = sums[..., 0]
+        _, x, y, xx, xy, yy, q, xq, yq, qq = np.moveaxis(sums / n[..., None], -1, 0)
+        cxx, cxy, cyy, cxq, cyq = xx - x * x, xy - x * y, yy - y * y, xq - x * q, yq - y * q
+        det = cxx * cyy - cxy * cxy
+        mx, my = (cyy * cxq - cxy * cyq) / det, (cxx * cyq - cxy * cxq) / det
+        m = np.stack([mx, my, q - mx * x - my * y], axis=-1)
+        residual = np.sqrt(np.maximum(qq - q * q - mx * cxq - my * cyq, 0) * n / np.maximum(n - 3, 1))
         normals: Float64 = -m / np.linalg.norm(m, axis=-1, keepdims=True)
-    bad = ~(np.isfinite(depth) & (sums[0] > 2.5) & (det > _MIN_SPREAD * trace * trace) & (m[..., 2] != 0))
-    normals[bad] = np.nan
-    return normals
+        normals[~((n > 2.5) & (det > _MIN_SPREAD * (cxx + cyy) ** 2))] = np.nan
+    return normals, residual
 
 
-def _facing(normals: Float64, camera: Camera) -> Float64:
-    """Drop normals that a fit across an edge turned away from the camera (n . r >= 0)."""
-    away = np.einsum("hwc,hwc->hw", normals, camera.rays) >= 0
-    normals[away] = np.nan
+def _facing(normals: Float64, rays: Float64, depth: NDArray[np.floating]) -> Float64:
+    """Drop normals without depth, and those that a fit across an edge turned away from the camera (n . r >= 0)."""
+    away = np.einsum("...c,...c->...", normals, rays) >= 0
+    normals[away | ~np.isfinite(depth)] = np.nan
     return normals
 
 
@@ -80,11 +95,18 @@ def normals_from_depth(depth: NDArray[np.floating], camera: Camera, radius: int 
     Returns
     -------
     (H, W, 3) float64, unit, camera frame, facing the camera; NaN where depth is NaN or its window determines no plane.
+
+    Raises
+    ------
+    DataError
+        When depth is not of the camera's shape.
     """
-    return _facing(_solve(_box(_moments(depth, camera), radius), depth), camera)
+    return _facing(_fit(_box(_moments(depth, camera), radius))[0], camera.rays, depth)
 
 
-def gated_normals(depth: NDArray[np.floating], camera: Camera, radius: int = 4, gate: float = 0.05) -> Float64:
+def gated_normals(
+    depth: NDArray[np.floating], camera: Camera, radius: int = 4, gate: float = 0.05
+) -> Float64:
     """Fit a plane to each pixel's window, leaving out neighbours across depth edges.
 
     Parameters
@@ -98,13 +120,92 @@ def gated_normals(depth: NDArray[np.floating], camera: Camera, radius: int = 4, 
     -------
     As :func:`normals_from_depth`; costs a pass per pixel of the window.
     """
-    terms = np.pad(_moments(depth, camera), ((0, 0), (radius, radius), (radius, radius)))
+    terms = np.pad(_moments(depth, camera), ((radius, radius), (radius, radius), (0, 0)))
     z = np.pad(np.asarray(depth, dtype=np.float64), radius, constant_values=np.nan)
     height, width = camera.shape
-    sums = np.zeros((9, height, width))
+    sums = np.zeros((height, width, 10))
     for dv in range(2 * radius + 1):
         for du in range(2 * radius + 1):
             window = slice(dv, dv + height), slice(du, du + width)
             near = np.abs(z[window] - depth) <= gate * depth  # NaN compares false
-            sums += np.where(near, terms[(slice(None), *window)], 0.0)
-    return _facing(_solve(sums, depth), camera)
+            sums += np.where(near[..., None], terms[window], 0.0)
+    return _facing(_fit(sums)[0], camera.rays, depth)
+
+
+def _integral(moments: Float64) -> Float64:
+    """(H + 1, W + 1, 10) sums over all pixels above and to the left."""
+    out = np.zeros((moments.shape[0] + 1, moments.shape[1] + 1, moments.shape[2]))
+    np.cumsum(moments, axis=0, out=out[1:, 1:])
+    np.cumsum(out[1:, 1:], axis=1, out=out[1:, 1:])
+    return out
+
+
+class NormalField:
+    """Normals of a depth image wherever they are asked for, in windows as large as the surface is flat.
+
+    Windows of several sizes are fitted at each place, and the largest is taken whose residual is what noise leaves in such
+    windows (their median); beside creases that is a small one. The image's moments are summed once.
+
+    Parameters
+    ----------
+    depth
+        (H, W) z in metres; NaN: none.
+    camera
+        Intrinsics of the image.
+    """
+
+    def __init__(self, depth: NDArray[np.floating], camera: Camera) -> None:
+        self._integral = _integral(_moments(depth, camera))
+        self._shape = camera.shape
+
+    def _sums(self, u: NDArray[np.int64], v: NDArray[np.int64], radius: int) -> Float64:
+        height, width = self._shape
+        left, right = np.clip(u - radius, 0, width), np.clip(u + radius + 1, 0, width)
+        top, bottom = np.clip(v - radius, 0, height), np.clip(v + radius + 1, 0, height)
+        table = self._integral
+        out: Float64 = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
+        return out
+
+    def at(self, pixels: Float64, radii: Sequence[int] = RADII) -> Float64:
+        """Normals at pixel coordinates.
+
+        Parameters
+        ----------
+        pixels
+            (n, 2) as (u, v), inside the image.
+        radii
+            Of the windows to choose from, ascending.
+
+        Returns
+        -------
+        (n, 3) float64, unit, camera frame, facing the camera's plane; NaN where no window determines a plane.
+        """
+        u, v = np.rint(pixels).astype(np.int64).T
+        best = np.full((len(u), 3), np.nan)
+        for radius in radii:
+            normals, residual = _fit(self._sums(u, v, radius))
+            fitted = np.isfinite(normals[:, 0])
+            if not fitted.any():
+                continue
+            flat = fitted & (residual <= TOLERANCE * np.median(residual[fitted]))
+            flat |= np.isnan(best[:, 0]) & fitted
+            best[flat] = normals[flat]
+        return best
+
+
+def grazing(points: Float64, normals: Float64, eyes: Sequence[Float64]) -> Bool:
+    """Say where a surface is seen at more than 75 degrees from its normal.
+
+    Parameters
+    ----------
+    points, normals
+        (..., 3), one frame, metres; NaN gives False.
+    eyes
+        Camera centres (3,) in that frame; one grazing view is enough.
+    """
+    out = np.zeros(points.shape[:-1], dtype=bool)
+    for eye in eyes:
+        rays = points - eye
+        cosine = -np.einsum("...c,...c->...", normals, rays) / np.linalg.norm(rays, axis=-1)
+        out |= cosine < GRAZING_COSINE
+    return out

@@ -12,7 +12,7 @@ never leaks through a foreground that is sparser than the image.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ Int64 = NDArray[np.int64]
 
 STEEPEST = 5.67  # tan 80 deg: neighbours further apart in depth are not one surface
 FILLED_GAP = 4  # pixels; a hole that is not wider, in a smooth surface, is interpolated
-GRAZING_COSINE = 0.25882  # cos 75 deg
 HIDES = 0.002  # m, and relative; a skirt hides the sheet when it is nearer by both
 CHUNK = 1_000_000  # pairs of ray and quad at a time
 
@@ -58,16 +57,19 @@ class Projection:
     ----------
     depth
         (H, W) float64, metres; NaN: no surface.
+    pixels
+        (H, W, 2) float64, (u, v) on the stereo grid of the point that is met; NaN where depth is.
     normals
-        (H, W, 3) float64, ToF frame, unit, facing the camera; NaN where depth is.
-    occluded, grazing, edge
+        (H, W, 3) float64, of the triangles, ToF frame, unit, facing the camera; NaN where depth is. As noisy as three
+        points make them.
+    occluded, edge
         (H, W) bool, reasons to mistrust the pixel.
     """
 
     depth: Float64
+    pixels: Float64
     normals: Float64
     occluded: Bool
-    grazing: Bool
     edge: Bool
 
 
@@ -137,7 +139,7 @@ def _extremes(image: Float64) -> tuple[Float64, Float64]:
 
 def _candidates(points: Float64, camera: Camera) -> tuple[Int64, Int64]:
     """Quads whose image bounds a pixel centre: flat quad index (n,), and (n, 4) bounds u0, u1, v0, v1, inclusive."""
-    pixels, z = camera.project(points)
+    pixels, _ = camera.project(points)
     (u0, u1), (v0, v1) = _extremes(pixels[..., 0]), _extremes(pixels[..., 1])
     with np.errstate(invalid="ignore"):
         bounds = [
@@ -179,12 +181,13 @@ def _intersect(points: Float64, camera: Camera) -> _Hits:
         (bc, np.cross(c, a), np.cross(a, b), None, np.einsum("nc,nc->n", a, bc)),
         (None, np.cross(d, c), np.cross(b, d), -bc, -np.einsum("nc,nc->n", d, bc)),
     )
-    found = []
+    nothing = np.zeros(0, dtype=np.int64)
+    found = [_Hits(nothing, np.zeros(0), np.zeros((0, 4), dtype=np.int64), np.zeros((0, 4)))]
     for quad, u, v in _pairs(bounds):
         rays = camera.rays[v, u]
         for *crosses, det in halves:
             found.append(_through(rays, quad, crosses, det, corners, v * camera.width + u))
-    return _Hits(*(np.concatenate([getattr(f, k) for f in found]) for k in ("pixel", "depth", "corners", "weights")))
+    return _Hits(*(np.concatenate([getattr(f, k.name) for f in found]) for k in fields(_Hits)))
 
 
 def _through(
@@ -211,17 +214,20 @@ def _nearest(hits: _Hits, camera: Camera) -> tuple[Float64, Int64]:
     return depth.reshape(camera.shape), index.reshape(camera.shape)
 
 
-def _normals_at(hits: _Hits, normals: Float64, points: Float64) -> Float64:
-    """Interpolate vertex normals; where a triangle has none, take its own, turned towards the camera."""
-    vertex = normals.reshape(-1, 3)[hits.corners]  # (n, 4, 3)
-    mixed = np.einsum("nk,nkc->nc", hits.weights, np.nan_to_num(vertex))
+def _triangle_normals(hits: _Hits, points: Float64) -> Float64:
+    """Unit normals (n, 3) of the triangles, pointing to the side from which the stereo camera saw them."""
     a, b, c, d = np.moveaxis(points.reshape(-1, 3)[hits.corners], 1, 0)
-    flat = np.cross(b - c, d - a)
-    flat *= -np.sign(np.einsum("nc,nc->n", flat, a))[:, None]
-    length = np.linalg.norm(mixed, axis=1, keepdims=True)
-    mixed = np.where(length > 0.1, mixed, flat)
-    out: Float64 = mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-300)
+    upper = hits.weights[:, 3] == 0
+    normals = np.where(upper[:, None], np.cross(c - a, b - a), np.cross(b - d, c - d))
+    out: Float64 = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     return out
+
+
+def _grid_position(hits: _Hits, width: int) -> Float64:
+    """Return (n, 2) positions (u, v) on the stereo grid."""
+    row, column = np.divmod(hits.corners[:, 0], width)
+    _, b, c, d = hits.weights.T
+    return np.stack([column + b + d, row + c + d], axis=1)
 
 
 def _dilate(mask: Bool, radius: int) -> Bool:
@@ -255,14 +261,14 @@ def _jumps(depth: Float64, camera: Camera) -> Bool:
     with np.errstate(invalid="ignore"):
         across = np.abs(np.diff(depth, axis=1)) > np.fmin(limit[:, 1:], limit[:, :-1])
         down = np.abs(np.diff(depth, axis=0)) > np.fmin(limit[1:], limit[:-1])
-    for view, step in ((out[:, 1:], across), (out[:, :-1], across), (out[1:], down), (out[:-1], down)):
-        view |= step
+    out[:, 1:] |= across
+    out[:, :-1] |= across
+    out[1:] |= down
+    out[:-1] |= down
     return out
 
 
-def project(
-    sheet: Sheet, points: Float64, normals: Float64, stereo_eye: Float64, camera: Camera, edge_pixels: int
-) -> Projection:
+def project(sheet: Sheet, points: Float64, camera: Camera, edge_pixels: int) -> Projection:
     """Render the sheet into a camera on the ToF plane.
 
     Parameters
@@ -270,11 +276,7 @@ def project(
     sheet
         From :func:`triangulate`.
     points
-        (SH, SW, 3) the sheet's vertices in the ToF frame, metres.
-    normals
-        (SH, SW, 3) at the vertices, unit, ToF frame, facing the stereo camera; NaN: unknown.
-    stereo_eye
-        (3,) the stereo camera's centre in the ToF frame, metres.
+        (SH, SW, 3) the sheet's vertices in the ToF frame, metres; NaN: none.
     camera
         Intrinsics on the ToF plane, any size.
     edge_pixels
@@ -285,33 +287,25 @@ def project(
     Projection
     """
     hits = _intersect(points, camera)
-    quads = hits.corners[:, 0]
-    row, column = np.divmod(quads, points.shape[1])
-    real = sheet.surface[row, column]
-    n = np.full((len(quads), 3), np.nan)
-    n[real] = _normals_at(hits.only(real), normals, points)
-    rays = camera.rays.reshape(-1, 3)[hits.pixel]
+    normals = _triangle_normals(hits, points)
+    row, column = np.divmod(hits.corners[:, 0], points.shape[1])
     # The back of the sheet is no surface either: the ray came through space behind it.
-    real &= np.einsum("nc,nc->n", n, rays) < 0
+    front = np.einsum("nc,nc->n", normals, camera.rays.reshape(-1, 3)[hits.pixel]) < 0
+    real = sheet.surface[row, column] & front
     depth, index = _nearest(hits.only(real), camera)
     skirt, _ = _nearest(hits.only(~real), camera)
     hit = index >= 0
-    out_normals = np.where(hit[..., None], n[real][index] if real.any() else np.nan, np.nan)
-    edge = _dilate(~hit | _borders(sheet, points, camera, depth) | _jumps(depth, camera), edge_pixels)
     return Projection(
         depth=depth,
-        normals=out_normals,
+        pixels=_spread(_grid_position(hits, points.shape[1])[real], index),
+        normals=_spread(normals[real], index),
         occluded=np.isfinite(skirt) & ~(skirt > depth * (1 - HIDES) - HIDES),
-        grazing=hit & _grazing(camera.unproject(depth), out_normals, stereo_eye),
-        edge=edge,
+        edge=_dilate(~hit | _borders(sheet, points, camera, depth) | _jumps(depth, camera), edge_pixels),
     )
 
 
-def _grazing(points: Float64, normals: Float64, stereo_eye: Float64) -> Bool:
-    """Seen at more than 75 degrees from the normal, by the ToF camera or by the stereo camera."""
-    out = np.zeros(points.shape[:2], dtype=bool)
-    for eye in (np.zeros(3), stereo_eye):
-        rays = points - eye
-        cosine = -np.einsum("hwc,hwc->hw", normals, rays) / np.linalg.norm(rays, axis=-1)
-        out |= cosine < GRAZING_COSINE
+def _spread(values: Float64, index: Int64) -> Float64:
+    """Image of ``values[index]``, NaN where the index is -1."""
+    out = np.full((*index.shape, values.shape[1]), np.nan)
+    out[index >= 0] = values[index[index >= 0]]
     return out

@@ -31,7 +31,9 @@ def register(points_stereo: NDArray[np.floating], T_tof_stereo: Float64, far: fl
         When the point map is not organised.
     """
     if points_stereo.ndim != 3 or points_stereo.shape[2] != 3:
-        raise DataError(f"register: expected an organised point map (H, W, 3), got shape {points_stereo.shape}")
+        raise DataError(
+            f"register: expected an organised point map (H, W, 3), got shape {points_stereo.shape}"
+        )
     points = transform_points(T_tof_stereo, points_stereo)
     z = points[..., 2]
     points[~((z > 0) & (z < far))] = np.nan  # NaN compares false

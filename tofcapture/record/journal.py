@@ -1,14 +1,15 @@
 """The recording's journal: one row per view, in SQLite; who writes it holds the recording.
 
-The journal says what should be there and what is; the sealed files themselves are the truth. At start both are reconciled:
-a sealed file without a row is verified and adopted, a row without a file is planned again, leftovers of a killed writer go.
+The journal says what should be there and what is; the sealed files themselves are the truth, and ``record.reconcile`` makes the
+journal agree with them.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -18,14 +19,24 @@ from typing import Any
 from tofcapture.errors import BusyError, ConfigError, DataError
 
 _SCHEMA = """
-CREATE TABLE IF NOT EXISTS view (
-    scene TEXT NOT NULL, number INTEGER NOT NULL, pose TEXT NOT NULL,
+CREATE TABLE IF NOT EXISTS views (
+    scene TEXT NOT NULL, "index" INTEGER NOT NULL, pose TEXT NOT NULL,
     state TEXT NOT NULL CHECK (state IN ('planned', 'sealed', 'failed')),
     sha256 TEXT, attempts INTEGER NOT NULL DEFAULT 0, reason TEXT NOT NULL DEFAULT '',
     planned_utc TEXT NOT NULL, changed_utc TEXT NOT NULL,
-    PRIMARY KEY (scene, number)
+    PRIMARY KEY (scene, "index")
 );
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+"""
+
+
+_PLAN = """
+INSERT INTO views (scene, "index", pose, state, planned_utc, changed_utc) VALUES (?, ?, ?, 'planned', ?, ?)
+ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'planned', changed_utc = excluded.changed_utc WHERE state != 'sealed'
+"""
+_ADOPT = """
+INSERT INTO views (scene, "index", pose, state, sha256, planned_utc, changed_utc) VALUES (?, ?, ?, 'sealed', ?, ?, ?)
+ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'sealed', sha256 = excluded.sha256, reason = ''
 """
 
 
@@ -70,17 +81,13 @@ def hold(recording: Path) -> Iterator[None]:
         except BlockingIOError as err:
             file.seek(0)
             holder = file.read().strip() or "unknown"
-            raise BusyError(f"{recording}: another recorder (process {holder}) is at work", hint="wait for it to end") from err
+            raise BusyError(
+                f"{recording}: another recorder (process {holder}) is at work", hint="wait for it to end"
+            ) from err
         file.truncate(0)
-        file.write(str(_pid()))
+        file.write(str(os.getpid()))
         file.flush()
         yield
-
-
-def _pid() -> int:
-    import os
-
-    return os.getpid()
 
 
 class Journal:
@@ -100,7 +107,9 @@ class Journal:
             self._db.execute("PRAGMA synchronous=FULL")
             self._db.executescript(_SCHEMA)
         except sqlite3.DatabaseError as err:
-            raise DataError(f"{path}: not a journal: {err}", hint="move it away: it is rebuilt from the view files") from err
+            raise DataError(
+                f"{path}: not a journal: {err}", hint="move it away: it is rebuilt from the view files"
+            ) from err
 
     def close(self) -> None:
         """Close the database."""
@@ -110,7 +119,7 @@ class Journal:
         """All rows, or those of one scene, by scene and number."""
         where, values = ("WHERE scene = ?", (scene,)) if scene else ("", ())
         found = self._db.execute(
-            f"SELECT scene, number, pose, state, sha256, attempts, reason FROM view {where} ORDER BY scene, number",  # noqa: S608
+            f'SELECT scene, "index", pose, state, sha256, attempts, reason FROM views {where} ORDER BY scene, "index"',  # noqa: S608
             values,
         )
         return [Row(*row) for row in found]
@@ -138,30 +147,27 @@ class Journal:
                     hint="go on with the same station and options, or record into another folder",
                 )
 
-    def expect(self, scene: str, poses: Mapping[int, str]) -> None:
-        """Note planned views (index -> digest of the pose).
+    def expect(self, scene: str, poses: Mapping[int, str]) -> set[int]:
+        """Note planned views (index -> digest of the pose) and say which of them are there already.
 
         Raises
         ------
         ConfigError
             When a view of that number was recorded at another pose.
         """
-        for row in self.rows(scene):
-            if row.state == "sealed" and row.pose and poses.get(row.index, row.pose) != row.pose:
+        sealed = {row.index: row.pose for row in self.rows(scene) if row.state == "sealed"}
+        for index in sorted(sealed.keys() & poses.keys()):
+            if sealed[index] != poses[index]:
                 raise ConfigError(
-                    f"view {row.index} of {scene!r} was recorded at pose {row.pose}, the plan wants {poses[row.index]}",
+                    f"view {index} of {scene!r} was recorded at pose {sealed[index]}, the plan wants {poses[index]}",
                     hint="use the same --seed and --station as before, or record into another folder",
                 )
         now = utc_now()
         self._db.execute("BEGIN")
         for index, pose in poses.items():
-            self._db.execute(
-                "INSERT INTO view (scene, number, pose, state, planned_utc, changed_utc) VALUES (?, ?, ?, 'planned', ?, ?) "
-                "ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'planned', changed_utc = excluded.changed_utc "
-                "WHERE state != 'sealed'",
-                (scene, index, pose, now, now),
-            )
+            self._db.execute(_PLAN, (scene, index, pose, now, now))
         self._db.execute("COMMIT")
+        return sealed.keys() & poses.keys()
 
     def attempt(self, scene: str, index: int) -> None:
         """Count one more attempt, before anything moves."""
@@ -182,15 +188,11 @@ class Journal:
     def adopt(self, scene: str, index: int, pose: str, sha256: str) -> None:
         """Note a verified file that the journal did not know to be sealed."""
         now = utc_now()
-        self._db.execute(
-            "INSERT INTO view (scene, number, pose, state, sha256, planned_utc, changed_utc) VALUES (?, ?, ?, 'sealed', ?, ?, ?) "
-            "ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'sealed', sha256 = excluded.sha256, reason = ''",
-            (scene, index, pose, sha256, now, now),
-        )
+        self._db.execute(_ADOPT, (scene, index, pose, sha256, now, now))
 
     def _set(self, scene: str, index: int, change: str, *values: object) -> None:
         self._db.execute(
-            f"UPDATE view SET {change}, changed_utc = ? WHERE scene = ? AND number = ?",  # noqa: S608
+            f'UPDATE views SET {change}, changed_utc = ? WHERE scene = ? AND "index" = ?',  # noqa: S608
             (*values, utc_now(), scene, index),
         )
 
@@ -202,80 +204,3 @@ def _first_difference(known: Any, now: Any, where: str = "") -> str:
             if known.get(key) != now.get(key):
                 return _first_difference(known.get(key), now.get(key), f"{where}.{key}")
     return f"{where.lstrip('.') or 'value'} = {known!r}, got {now!r}"
-
-
-def reconcile(journal: Journal, recording: Path, scenes: Iterable[str] | None = None) -> list[str]:
-    """Make journal and files agree; see the module's first lines.
-
-    Parameters
-    ----------
-    journal, recording
-        Both held by this process.
-    scenes
-        Only these; all by default.
-
-    Returns
-    -------
-    One sentence for each thing that was put right.
-    """
-    views = recording / "views"
-    folders = sorted(p for p in views.iterdir() if p.is_dir()) if views.is_dir() else []
-    if scenes is not None:
-        folders = [p for p in folders if p.name in set(scenes)]
-    done: list[str] = []
-    sealed = {(row.scene, row.index): row.sha256 for row in journal.rows() if row.state == "sealed"}
-    for folder in folders:
-        done += _sweep(folder)
-        done += _adopt(journal, folder, sealed)
-    return done + _miss(journal, recording, sealed, scenes)
-
-
-def _sweep(folder: Path) -> list[str]:
-    """Remove what killed writers left."""
-    stray = sorted(folder.glob("*.partial"))
-    for path in stray:
-        path.unlink()
-    return [f"{path}: removed, it was never finished" for path in stray]
-
-
-def _adopt(journal: Journal, folder: Path, sealed: Mapping[tuple[str, int], str | None]) -> list[str]:
-    """Take whole files that the journal does not know; set damaged ones aside."""
-    from tofcapture.files.seal import verify_digest
-    from tofcapture.files.view import read_view
-
-    done = []
-    for path in sorted(folder.glob("view-*.h5")):
-        number = path.stem.removeprefix("view-")
-        if not number.isdigit() or (folder.name, int(number)) in sealed:
-            continue
-        try:
-            sha256 = verify_digest(path)
-            view = read_view(path)
-            if (view.scene, view.index) != (folder.name, int(number)):
-                raise DataError(f"{path}: it says it is view {view.index} of {view.scene!r}")
-            journal.adopt(folder.name, int(number), str(view.provenance.get("pose", "")), sha256)
-            done.append(f"{path}: adopted, it was sealed but not in the journal")
-        except DataError as err:
-            done.append(f"{path}: set aside as {_set_aside(path).name}: {err.message}")
-    return done
-
-
-def _set_aside(path: Path) -> Path:
-    """Rename a damaged file, so that its view can be taken again; nothing is ever deleted that might be data."""
-    aside = path.with_name(f"{path.name}.damaged")
-    path.rename(aside)
-    return aside
-
-
-def _miss(
-    journal: Journal, recording: Path, sealed: Mapping[tuple[str, int], str | None], scenes: Iterable[str] | None
-) -> list[str]:
-    """Plan sealed views again whose file is gone."""
-    from tofcapture.files.view import view_path
-
-    done = []
-    for scene, index in sealed:
-        if (scenes is None or scene in set(scenes)) and not view_path(recording, scene, index).exists():
-            journal.forget(scene, index, "the file was gone")
-            done.append(f"view {index} of {scene!r}: its file is gone, it will be taken again")
-    return done

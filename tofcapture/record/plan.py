@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices.sim.kinematics import HOME, ArmModel, forward, inverse_all, wrap
+from tofcapture.devices.kinematics import ArmModel, forward, inverse_all, wrap
 from tofcapture.poses import Float64, invert, look_at, rotate_vectors
 from tofcapture.record.clearance import REASONS, Stage, is_clear, obstacles
 from tofcapture.rig import Rig
+
+Bools = NDArray[np.bool_]
 
 _LOG_DISTANCE = 0.6  # rad per e-fold of distance: how much a nearer view counts against a turned one
 _FEW = 24  # candidates that each pick of the sampling chooses among
@@ -90,7 +92,7 @@ class PlannedView:
     @property
     def digest(self) -> str:
         """Names the pose; a view of another digest is another view."""
-        return hashlib.sha256(np.round(self.joints, 9).tobytes()).hexdigest()[:16]
+        return hashlib.sha256((np.round(self.joints, 6) + 0.0).tobytes()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,8 @@ class Plan:
     candidates
         How many were tried.
     refused
-        Reason -> number of candidates: ``reach``, and those of :data:`clearance.REASONS`.
+        Reason -> number of candidates: ``reach``; those of :data:`clearance.REASONS`; ``mixed``, no branch clear for one
+        reason alone; ``way from home``, of the candidates that sampling came upon.
     """
 
     views: tuple[PlannedView, ...]
@@ -133,7 +136,12 @@ class Plan:
             "candidates": self.candidates,
             "refused": self.refused,
             "views": [
-                {"index": v.index, "joints": v.joints.tolist(), "distance": v.distance, "direction": v.direction.tolist()}
+                {
+                    "index": v.index,
+                    "joints": v.joints.tolist(),
+                    "distance": v.distance,
+                    "direction": v.direction.tolist(),
+                }
                 for v in self.views
             ],
         }
@@ -171,13 +179,21 @@ def plan_views(
     directions, distances = _candidates(sampling, rng)
     T_base_flange = _flange_poses(rig, target, sampling, directions, distances, rng)
     joints, refused = _branches(model, rig, stage, T_base_flange)
-    usable = np.isfinite(joints).all(axis=-1)
+    usable: Bools = np.all(np.isfinite(joints), axis=-1)
     features = np.column_stack([directions, _LOG_DISTANCE * np.log(distances)])
-    chosen = _spread(features, usable, views, lambda k: is_clear(model, rig, stage, HOME, joints[k]), rng)
+    refused["way from home"] = 0
+
+    def accept(k: int) -> bool:
+        clear = is_clear(model, rig, stage, stage.home, joints[k])
+        refused["way from home"] += not clear
+        return clear
+
+    chosen = _spread(features, usable, views, accept, rng)
     planned = [
-        PlannedView(i, joints[k], forward(model, joints[k]), float(distances[k]), directions[k]) for i, k in enumerate(chosen)
+        PlannedView(i, joints[k], forward(model, joints[k]), float(distances[k]), directions[k])
+        for i, k in enumerate(chosen)
     ]
-    return Plan(tuple(_by_travel(planned)), views, len(usable), refused)
+    return Plan(tuple(_by_travel(planned, stage.home)), views, len(usable), refused)
 
 
 def _candidates(sampling: Sampling, rng: np.random.Generator) -> tuple[Float64, Float64]:
@@ -195,34 +211,46 @@ def _candidates(sampling: Sampling, rng: np.random.Generator) -> tuple[Float64, 
 
 
 def _flange_poses(
-    rig: Rig, target: Float64, sampling: Sampling, directions: Float64, distances: Float64, rng: np.random.Generator
+    rig: Rig,
+    target: Float64,
+    sampling: Sampling,
+    directions: Float64,
+    distances: Float64,
+    rng: np.random.Generator,
 ) -> Float64:
     """(C, rolls, 4, 4) flange poses from which the ToF camera looks at the target, one per roll."""
     spots = target + rng.uniform(-sampling.aim, sampling.aim, directions.shape)
-    rolls = 2 * np.pi * (np.arange(sampling.rolls) / sampling.rolls) + rng.uniform(0, 2 * np.pi, (len(spots), 1))
-    cameras = np.stack([look_at(spot + r * u, spot) for spot, r, u in zip(spots, distances, directions, strict=True)])
+    rolls = 2 * np.pi * (np.arange(sampling.rolls) / sampling.rolls) + rng.uniform(
+        0, 2 * np.pi, (len(spots), 1)
+    )
+    cameras = np.stack(
+        [look_at(spot + r * u, spot) for spot, r, u in zip(spots, distances, directions, strict=True)]
+    )
     c, s = np.cos(rolls), np.sin(rolls)
     turns = np.broadcast_to(np.eye(4), (*rolls.shape, 4, 4)).copy()
     turns[..., 0, 0], turns[..., 0, 1], turns[..., 1, 0], turns[..., 1, 1] = c, -s, s, c
     return cameras[:, None] @ turns @ invert(rig.T_flange_tof)
 
 
-def _branches(model: ArmModel, rig: Rig, stage: Stage, T_base_flange: Float64) -> tuple[Float64, dict[str, int]]:
+def _branches(
+    model: ArmModel, rig: Rig, stage: Stage, T_base_flange: Float64
+) -> tuple[Float64, dict[str, int]]:
     """(C, 6) of the clear branch and roll nearest to home, NaN where there is none; what stood in the way how often."""
     count = len(T_base_flange)
-    q = HOME + wrap(inverse_all(model, T_base_flange) - HOME)
+    q = stage.home + wrap(inverse_all(model, T_base_flange) - stage.home)
     q = q.reshape(count, -1, 6)
-    reached = np.isfinite(q).all(axis=-1) & (np.abs(np.nan_to_num(q)) <= model.limit).all(axis=-1)
+    reached: Bools = np.all(np.abs(q) <= model.limit, axis=-1)  # NaN is not
     hits = np.zeros((*reached.shape, len(REASONS)), dtype=bool)
     hits[reached] = obstacles(model, rig, stage, q[reached])
-    clear = reached & ~hits.any(axis=-1)
-    cost = np.where(clear, (_BRANCH * np.nan_to_num(q - HOME) ** 2).sum(axis=-1), np.inf)
+    clear: Bools = reached & ~np.any(hits, axis=-1)
+    cost = np.where(clear, (_BRANCH * np.nan_to_num(q - stage.home) ** 2).sum(axis=-1), np.inf)
     best = q[np.arange(count), cost.argmin(axis=1)]
-    lost = ~clear.any(axis=1)
-    return np.where(lost[:, None], np.nan, best), _tally(reached, hits, lost)
+    lost: Bools = ~np.any(clear, axis=1)
+    # Rounded to a millionth, goals are the same on machines whose last bits differ.
+    return np.where(lost[:, None], np.nan, np.round(best, 6)), _tally(reached, hits, lost)
 
 
-def _tally(reached: NDArray[np.bool_], hits: NDArray[np.bool_], lost: NDArray[np.bool_]) -> dict[str, int]:
+def _tally(reached: Bools, hits: Bools, lost: Bools) -> dict[str, int]:
     """Count each lost candidate under the first reason that stands against all of its branches, else under ``mixed``."""
     out = {"reach": int((~reached.any(axis=1)).sum())}
     left = lost & reached.any(axis=1)
@@ -235,7 +263,11 @@ def _tally(reached: NDArray[np.bool_], hits: NDArray[np.bool_], lost: NDArray[np
 
 
 def _spread(
-    features: Float64, usable: NDArray[np.bool_], views: int, accept: Callable[[int], bool], rng: np.random.Generator
+    features: Float64,
+    usable: Bools,
+    views: int,
+    accept: Callable[[int], bool],
+    rng: np.random.Generator,
 ) -> list[int]:
     """Farthest-point sampling (greedy, so that fewer views are a prefix of more).
 
@@ -255,9 +287,9 @@ def _spread(
     return chosen
 
 
-def _by_travel(views: Sequence[PlannedView]) -> list[PlannedView]:
+def _by_travel(views: Sequence[PlannedView], home: Float64) -> list[PlannedView]:
     """Order by nearest neighbour in weighted joint space, starting from home."""
-    left, here, out = list(views), HOME, []
+    left, here, out = list(views), home, []
     while left:
         costs = [float(np.abs(_BRANCH * (v.joints - here)).max()) for v in left]
         out.append(left.pop(int(np.argmin(costs))))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import shutil
 from collections.abc import Callable
@@ -14,23 +13,32 @@ from typing import Any
 import numpy as np
 
 from tofcapture import __version__
-from tofcapture.devices.sim.kinematics import arm_model
-from tofcapture.devices.sim.scenes import CALIBRATION
+from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.station import Station
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
-from tofcapture.files.view import check_scene_name, view_path, write_view
+from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, View
 from tofcapture.poses import Float64, invert, rotation_angle
 from tofcapture.record.clearance import route, stage_of
-from tofcapture.record.journal import Journal, hold, reconcile, utc_now
-from tofcapture.record.plan import Plan, PlannedView, board_sampling, object_sampling, plan_views
+from tofcapture.record.journal import Journal, hold, utc_now
+from tofcapture.record.plan import Plan, PlannedView
+from tofcapture.record.reconcile import reconcile
+from tofcapture.record.scene_plan import plan_scene
 
 _VIEW_BYTES = 40e6  # a view of a full-size rig with truth, and room to spare
 _RESERVE_BYTES = 0.5e9
 _ATTEMPTS = 3
-_MOTION = (0.2e-3, np.radians(0.02))  # m, rad: more between the first and the last exposure, and the view is retaken
+_GIVE_UP = 2  # views in a row that fail before the run ends
+_MOTION = (
+    0.2e-3,
+    np.radians(0.02),
+)  # m, rad: more between the first and the last exposure, and the view is retaken
 
 Progress = Callable[[int, int], None]
+
+
+def _silent(done: int, total: int) -> None:
+    del done, total
 
 
 @dataclass(frozen=True)
@@ -66,7 +74,7 @@ def record(
     recording: Path,
     views: int = 25,
     frames: int = 10,
-    progress: Progress | None = None,
+    progress: Progress = _silent,
 ) -> RecordResult:
     """Take every missing view of one scene.
 
@@ -92,22 +100,38 @@ def record(
         The recording was begun with other cameras, frames or poses; or the disk is too small.
     BusyError
         Another recorder is at work on this recording.
+    DeviceError
+        Two views in a row failed three times each.
     """
+    if frames < 1:
+        raise ConfigError(f"frames: expected at least 1, got {frames}")
     plan = plan_scene(station, scene, views)
     _begin(recording, station)
     with hold(recording), closing(Journal(recording)) as journal:
-        journal.agree({"station": station.describe(), "frames": frames})
-        repaired = reconcile(journal, recording, [scene])
-        journal.expect(scene, {view.index: view.digest for view in plan.views})
-        kept = {row.index for row in journal.rows(scene) if row.state == "sealed"}
+        journal.agree({"station": station.describe(), "frames": frames, "sim": station.config.get("sim", {})})
+        repaired = reconcile(journal, recording, scene)
+        kept = journal.expect(scene, {view.index: view.digest for view in plan.views})
         missing = [view for view in plan.views if view.index not in kept]
         _check_space(recording, len(missing))
-        reasons = _take_all(station, scene, plan, missing, recording, frames, journal, progress or _silent)
-    taken = [view.index for view in missing if view.index not in reasons]
+        if missing:
+            station.operator.place(scene)
+        reasons: dict[int, str] = {}
+        for turn, planned in enumerate(missing):
+            progress(len(kept) + turn - len(reasons), len(plan.views))
+            try:
+                view = _take(station, scene, planned, frames, _provenance(station, plan, planned), journal)
+                digest = write_view(view_path(recording, scene, planned.index), view)
+                journal.seal(scene, planned.index, digest)
+            except DeviceError as err:
+                journal.fail(scene, planned.index, err.message)
+                reasons[planned.index] = err.message
+                if _hopeless(missing[: turn + 1], reasons):
+                    raise
+        progress(len(plan.views) - len(reasons), len(plan.views))
     return RecordResult(
         scene=scene,
-        recorded=tuple(sorted(taken)),
-        kept=tuple(sorted(kept & {view.index for view in plan.views})),
+        recorded=tuple(sorted({view.index for view in missing} - reasons.keys())),
+        kept=tuple(sorted(kept)),
         failed=tuple(sorted(reasons)),
         reasons=tuple(f"view {i}: {reasons[i]}" for i in sorted(reasons)),
         repaired=tuple(repaired),
@@ -115,40 +139,9 @@ def record(
     )
 
 
-def plan_scene(station: Station, scene: str, views: int) -> Plan:
-    """Plan the views of a scene on a station: its arm, its rig, its ``[plan]``, its seed.
-
-    Raises
-    ------
-    ConfigError
-        The name is no safe file name, no view is wanted, or not one can be reached.
-    """
-    check_scene_name(scene)
-    if views < 1:
-        raise ConfigError(f"views: expected at least 1, got {views}")
-    stage = stage_of(station.config)
-    board = scene == CALIBRATION
-    plan = plan_views(
-        arm_model(station.arm.describe().model),
-        station.rig,
-        stage,
-        stage.board if board else stage.target,
-        board_sampling(stage) if board else object_sampling(),
-        views,
-        _generator(station.seed, scene),
-    )
-    if not plan.views:
-        raise ConfigError(f"no view of {scene!r} can be taken: {plan.summary()}", hint="move the target, see [plan] of the station")
-    return plan
-
-
-def _generator(seed: int, scene: str) -> np.random.Generator:
-    digest = hashlib.sha256(f"plan|{seed}|{scene}".encode()).digest()
-    return np.random.default_rng(np.frombuffer(digest, dtype="<u4").tolist())
-
-
-def _silent(done: int, total: int) -> None:
-    del done, total
+def _hopeless(tried: list[PlannedView], reasons: dict[int, str]) -> bool:
+    """Tell whether the last views tried failed one after the other: that is no bad pose, that is a broken device."""
+    return len(tried) >= _GIVE_UP and all(view.index in reasons for view in tried[-_GIVE_UP:])
 
 
 def _begin(recording: Path, station: Station) -> None:
@@ -168,39 +161,19 @@ def _check_space(recording: Path, missing: int) -> None:
     free = shutil.disk_usage(recording).free
     needed = missing * _VIEW_BYTES + _RESERVE_BYTES
     if missing and free < needed:
-        raise ConfigError(f"{recording}: expected {needed / 1e9:.1f} GB of free disk, got {free / 1e9:.1f} GB", hint="free some space, or ask for fewer views")
-
-
-def _take_all(
-    station: Station,
-    scene: str,
-    plan: Plan,
-    missing: list[PlannedView],
-    recording: Path,
-    frames: int,
-    journal: Journal,
-    progress: Progress,
-) -> dict[int, str]:
-    """Take the missing views one after the other; index -> reason for those given up."""
-    there, reasons = len(plan.views) - len(missing), dict[int, str]()
-    progress(there, len(plan.views))
-    if missing:
-        station.operator.place(scene)
-    for planned in missing:
-        try:
-            view = _take(station, scene, planned, frames, _provenance(station, plan, planned), journal)
-        except DeviceError as err:
-            reasons[planned.index] = err.message
-            journal.fail(scene, planned.index, err.message)
-            continue
-        journal.seal(scene, planned.index, write_view(view_path(recording, scene, planned.index), view))
-        there += 1
-        progress(there, len(plan.views))
-    return reasons
+        raise ConfigError(
+            f"{recording}: expected {needed / 1e9:.1f} GB of free disk, got {free / 1e9:.1f} GB",
+            hint="free some space, or ask for fewer views",
+        )
 
 
 def _take(
-    station: Station, scene: str, planned: PlannedView, frames: int, provenance: dict[str, Any], journal: Journal
+    station: Station,
+    scene: str,
+    planned: PlannedView,
+    frames: int,
+    provenance: dict[str, Any],
+    journal: Journal,
 ) -> View:
     """Take one view, three times at most; a refused motion is refused for good."""
     for attempt in range(1, _ATTEMPTS + 1):
@@ -215,7 +188,9 @@ def _take(
     raise AssertionError
 
 
-def capture(station: Station, scene: str, planned: PlannedView, frames: int, provenance: dict[str, Any]) -> View:
+def capture(
+    station: Station, scene: str, planned: PlannedView, frames: int, provenance: dict[str, Any]
+) -> View:
     """Go there and take one view: arm, ToF burst, stereo frame, arm again.
 
     ToF comes first and alone: the stereo camera's projector would shine into its pixels.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofcapture.devices.sim.kinematics import HOME, arm_model, forward
+from tofcapture.devices.kinematics import HOME, arm_model, forward
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 from tofcapture.frames import ArmInfo, ArmState
 from tofcapture.poses import Float64, exp
@@ -55,7 +55,7 @@ class SimArm:
     Parameters
     ----------
     table
-        ``model`` (``ur10e`` or ``ur5e``) and optionally ``home`` (6 joint angles, radians).
+        ``model``: ``ur10e`` or ``ur5e``.
     context
         The station; holds the simulated world.
     """
@@ -63,16 +63,15 @@ class SimArm:
     simulated = True  # moves nothing that could hurt anyone
 
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
-        unknown = table.keys() - {"model", "home"}
+        unknown = table.keys() - {"model"}
         if unknown:
-            raise ConfigError(f"[arm] does not know {', '.join(sorted(unknown))}", hint="it knows model, home")
+            raise ConfigError(f"[arm] does not know {', '.join(sorted(unknown))}", hint="it knows model")
         self._context = context
         self._model = arm_model(str(table.get("model", "ur10e")))
-        self._home = _joints(table.get("home", HOME), self._model.limit)
         self._joints: Float64 | None = None
 
     def __enter__(self) -> Self:
-        self.move_to(self._home)
+        self.move_to(HOME)
         return self
 
     def __exit__(
@@ -88,7 +87,9 @@ class SimArm:
         """Report the commanded joints; the repeatability error is what no arm can know of itself."""
         if self._joints is None:
             raise DeviceError("the simulated arm is not open", hint="use the station as a context manager")
-        return ArmState(self._joints.copy(), forward(self._model, self._joints), shared_clock(self._context)())
+        return ArmState(
+            self._joints.copy(), forward(self._model, self._joints), shared_clock(self._context)()
+        )
 
     def move_to(self, joints: Float64) -> ArmState:
         """Move along the joints at the model's speed, settle, and report; takes no time of ours.
@@ -105,7 +106,7 @@ class SimArm:
         key = np.round(goal, 9).tobytes()
         error = _generator(world.seed, key).standard_normal(6) * REPEATABILITY
         world.set_pose(forward(self._model, goal) @ exp(error), key)
-        travel = float(np.abs(goal - self._home).max()) / self._model.speed
+        travel = float(np.abs(goal - HOME).max()) / self._model.speed
         shared_clock(self._context).arrive(travel + _SETTLE)
         self._joints = goal
         return self.state()

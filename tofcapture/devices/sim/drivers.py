@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -27,6 +26,12 @@ class _InWorld:
 
         return shared_world(self._context)
 
+    @property
+    def _clock(self) -> Callable[[], int]:
+        from tofcapture.devices.sim.arm import shared_clock
+
+        return shared_clock(self._context)
+
     def __enter__(self) -> Self:
         _ = self._world
         return self
@@ -46,7 +51,7 @@ class SimTof(_InWorld):
 
     def capture(self, frames: int) -> TofBurst:
         """Take a burst at the arm's present pose."""
-        return self._world.tof(frames, time.monotonic_ns)
+        return self._world.tof(frames, self._clock)
 
 
 class SimStereo(_InWorld):
@@ -58,7 +63,7 @@ class SimStereo(_InWorld):
 
     def capture(self) -> StereoFrame:
         """Take one point map at the arm's present pose."""
-        return self._world.stereo(time.monotonic_ns)
+        return self._world.stereo(self._clock)
 
 
 class SimOperator(_InWorld):

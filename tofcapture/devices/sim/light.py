@@ -179,8 +179,8 @@ def _filter(h: Complex64, samples: _Samples, camera: Camera) -> Complex64:
             w = (found[a] & found[b] & alike & near) * (tap[dy + reach] * tap[dx + reach])
             total[:, *a] += w * image[:, *b]
             weights[a] += w
-    out: Complex64 = (total / np.maximum(weights, np.float32(1e-9))).reshape(h.shape)
-    return out
+    mean = total / np.maximum(weights, np.float32(1e-9))
+    return mean.astype(np.complex64).reshape(h.shape)
 
 
 def _spread(

@@ -25,12 +25,18 @@ from tofcapture.errors import ConfigError
 from tofcapture.poses import Float64, rotation_exp, transform
 
 CALIBRATION = "calibration"
-TABLE_CENTRE = np.array([0.70, 0.0, -0.50])  # m, base frame, on the table top
-BOARD_CENTRE = TABLE_CENTRE + [0.0, 0.0, 0.28]
+TABLE_CENTRE: Float64 = np.array([0.70, 0.0, -0.50])  # m, base frame, on the table top
+BOARD_CENTRE = np.array([0.70, 0.0, -0.22])
 BOARD_TILT = np.radians(-15.0)  # about base y: the board leans towards the arm
 _TABLE = (1.2, 1.6, 0.04)  # m
 _FLOOR = -1.2  # m, z in the base frame
-_REACH = 0.16  # m; targets stay this close to the table's centre
+_REACH = 0.33  # m; targets stay within this disc about the table's centre
+
+
+def _on_table(x: float, y: float) -> Float64:
+    """(3,) point of the table top, from its centre, metres."""
+    out: Float64 = TABLE_CENTRE + [x, y, 0.0]  # noqa: RUF005  an addition of numbers
+    return out
 
 
 def generator(name: str, seed: int, purpose: str) -> np.random.Generator:
@@ -86,7 +92,9 @@ def _read(path: Path, unit: str) -> Mesh:
     mesh = settle(read_mesh(path, unit))
     size = float(np.ptp(mesh[0], axis=0).max())
     if not 0.005 < size < 1.0:
-        raise ConfigError(f"{path}: {size:.4g} m is no size for an object on the table", hint="set mesh_unit to m, cm or mm")
+        raise ConfigError(
+            f"{path}: {size:.4g} m is no size for an object on the table", hint="set mesh_unit to m, cm or mm"
+        )
     return mesh
 
 
@@ -100,7 +108,7 @@ def _arranged(items: Sequence[tuple[str, Mesh]], rng: np.random.Generator) -> li
         if place is None:
             continue
         discs.append((place, radius))
-        T = transform(rotation_exp([0, 0, rng.uniform(-np.pi, np.pi)]), TABLE_CENTRE + [*place, 0.0])
+        T = transform(rotation_exp([0, 0, rng.uniform(-np.pi, np.pi)]), _on_table(*place))
         out.append(SceneObject(vertices, triangles, float(rng.uniform(0.15, 0.9)), T, target=True, name=name))
     return out
 
@@ -110,16 +118,19 @@ def _free_place(
 ) -> Float64 | None:
     """(2,) place near the centre where a disc touches no other, or None when forty tries find none; the first is central."""
     if not discs:
-        return rng.uniform(-0.02, 0.02, 2)
-    for reach in np.linspace(0.06, _REACH, 40):
+        near: Float64 = rng.uniform(-0.02, 0.02, 2)
+        return near
+    for reach in np.linspace(0.06, _REACH - radius, 40):
         angle = rng.uniform(0, 2 * np.pi)
-        place = reach * np.array([np.cos(angle), np.sin(angle)])
+        place: Float64 = reach * np.array([np.cos(angle), np.sin(angle)])
         if all(np.linalg.norm(place - other) > radius + r + 0.005 for other, r in discs):
             return place
     return None
 
 
-def _solid(name: str, mesh: Mesh, albedo: float, at: ArrayLike, turn: ArrayLike = (0, 0, 0), *, target: bool = False) -> SceneObject:
+def _solid(
+    name: str, mesh: Mesh, albedo: float, at: ArrayLike, turn: ArrayLike = (0, 0, 0), *, target: bool = False
+) -> SceneObject:
     """Stand a mesh somewhere; ``turn`` is a rotation vector."""
     T = transform(rotation_exp(turn), np.asarray(at, dtype=np.float64))
     return SceneObject(mesh[0], mesh[1], float(albedo), T, target=target, name=name)
@@ -135,22 +146,24 @@ def _calibration() -> list[SceneObject]:
     block = move(cuboid(0.16, 0.12, 0.10), transform(rotation_exp([0.6, 0.0, 0.0]), [0, 0, 0]))
     pyramid = extrude(circle(0.11, segments=5), 0.16)
     pyramid = (pyramid[0] * np.where(pyramid[0][:, 2:] > 0, [0.25, 0.25, 1], [1.0, 1.0, 1]), pyramid[1])
-    ridge = move(extrude(np.array([[-0.1, 0], [0.1, 0], [0.0, 0.1]]), 0.18), transform(rotation_exp([np.pi / 2, 0, 0]), [0, 0, 0]))
-    at = TABLE_CENTRE
+    ridge = move(
+        extrude(np.array([[-0.1, 0], [0.1, 0], [0.0, 0.1]]), 0.18),
+        transform(rotation_exp([np.pi / 2, 0, 0]), [0, 0, 0]),
+    )
     return [
         _solid("board", plate, 0.7, BOARD_CENTRE, (0, BOARD_TILT, 0), target=True),
         *(_leg(x, y) for x, y in ((-0.06, 0.04), (0.12, 0.05), (-0.03, -0.16))),
-        _solid("ball", ball(0.085), 0.6, at + [0.06, 0.36, 0.0], target=True),
-        _solid("block", settle(block), 0.45, at + [-0.13, 0.40, 0.0], (0, 0, 0.5), target=True),
-        _solid("pyramid", settle(pyramid), 0.65, at + [-0.10, -0.38, 0.0], (0, 0, 0.3), target=True),
-        _solid("ridge", settle(ridge), 0.5, at + [0.15, -0.38, 0.0], (0, 0, 0.8), target=True),
-        _solid("peg", extrude(circle(0.05, segments=48), 0.12), 0.55, at + [0.36, 0.02, 0.0], target=True),
+        _solid("ball", ball(0.085), 0.6, _on_table(0.06, 0.36), target=True),
+        _solid("block", settle(block), 0.45, _on_table(-0.13, 0.40), (0, 0, 0.5), target=True),
+        _solid("pyramid", settle(pyramid), 0.65, _on_table(-0.10, -0.38), (0, 0, 0.3), target=True),
+        _solid("ridge", settle(ridge), 0.5, _on_table(0.15, -0.38), (0, 0, 0.8), target=True),
+        _solid("peg", extrude(circle(0.05, segments=48), 0.12), 0.55, _on_table(0.36, 0.02), target=True),
     ]  # fmt: skip
 
 
 def _leg(x: float, y: float) -> SceneObject:
     """Round leg under the board's point (x, y), between cut-outs; ends 3 mm below the plate."""
-    foot = TABLE_CENTRE + [x * np.cos(BOARD_TILT), y, 0.0]
+    foot = _on_table(x * np.cos(BOARD_TILT), y)
     height = BOARD_CENTRE[2] - TABLE_CENTRE[2] - x * np.sin(BOARD_TILT) - 0.005 - 0.003 - 0.004
     return _solid("leg", extrude(circle(0.012, segments=24), height), 0.5, foot)
 
@@ -165,7 +178,11 @@ def _surroundings(name: str, seed: int, *, clutter: bool) -> list[SceneObject]:
         _solid("floor", cuboid(6, 6, 0.1), rng.uniform(0.15, 0.6), [x, y, _FLOOR - 0.1]),
     ]
     if not clutter or rng.random() < 0.85:
-        out.append(_solid("back wall", cuboid(0.1, 6, 3.2), rng.uniform(0.3, 0.85), [rng.uniform(1.9, 3.0), 0, _FLOOR]))
+        out.append(
+            _solid(
+                "back wall", cuboid(0.1, 6, 3.2), rng.uniform(0.3, 0.85), [rng.uniform(1.9, 3.0), 0, _FLOOR]
+            )
+        )
     for side in (-1, 1):
         if rng.random() < 0.5:
             far = side * rng.uniform(1.4, 2.6)
@@ -180,7 +197,9 @@ def _clutter(rng: np.random.Generator) -> SceneObject:
     side = rng.choice([-1.0, 1.0])
     turn = (0.0, 0.0, rng.uniform(-np.pi, np.pi))
     if rng.random() < 0.5:
-        size = rng.uniform([0.06, 0.06, 0.04], [0.2, 0.2, 0.25])
-        return _solid("clutter", cuboid(*size), rng.uniform(0.15, 0.9), TABLE_CENTRE + [rng.uniform(-0.2, 0.5), side * rng.uniform(0.5, 0.66), 0], turn)  # fmt: skip
-    size = rng.uniform([0.2, 0.2, 0.3], [0.5, 0.5, 1.0])
-    return _solid("clutter", cuboid(*size), rng.uniform(0.15, 0.9), [rng.uniform(0.3, 1.6), side * rng.uniform(1.15, 1.3), _FLOOR], turn)  # fmt: skip
+        size = rng.uniform([0.06, 0.06, 0.04], [0.2, 0.2, 0.12])
+        place = _on_table(rng.uniform(-0.2, 0.5), side * rng.uniform(0.55, 0.68))
+    else:
+        size = rng.uniform([0.2, 0.2, 0.3], [0.5, 0.5, 1.0])
+        place = np.array([rng.uniform(0.3, 1.6), side * rng.uniform(1.15, 1.3), _FLOOR])
+    return _solid("clutter", cuboid(*size), rng.uniform(0.15, 0.9), place, turn)

@@ -54,12 +54,12 @@ class Sensor:
         Draw Poisson numbers of electrons.
     """
 
-    signal: float = 250.0
+    signal: float = 280.0
     contrast: tuple[float, ...] = (0.85, 0.6)
     exposure: float = 400e-6
     nominal_exposure: float = 400e-6
     ambient: float = 20.0
-    electrons_per_unit: float = 10.0
+    electrons_per_unit: float = 16.0
     read_noise: float = 20.0
     full_scale: float = 4095.0
     range_errors: tuple[RangeError, ...] = ()

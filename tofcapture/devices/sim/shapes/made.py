@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofcapture.devices.sim.shapes.mesh import Mesh, circle, cuboid, extrude, join, move, rectangle, settle, shift
+from tofcapture.devices.sim.shapes.mesh import (
+    Mesh,
+    circle,
+    cuboid,
+    extrude,
+    join,
+    move,
+    rectangle,
+    settle,
+    shift,
+)
 from tofcapture.poses import Float64, rotation_exp, transform
 
 BOARD_SIZE = (0.5, 0.4, 0.010)  # m
@@ -12,14 +22,14 @@ BOARD_SIZE = (0.5, 0.4, 0.010)  # m
 
 def box(rng: np.random.Generator) -> Mesh:
     """Carton of random proportions."""
-    return cuboid(*rng.uniform([0.05, 0.04, 0.04], [0.20, 0.15, 0.22]))
+    return cuboid(*rng.uniform([0.08, 0.06, 0.05], [0.24, 0.18, 0.24]))
 
 
 def stack(rng: np.random.Generator) -> Mesh:
     """Two to four boxes or discs on top of each other, each smaller and turned."""
-    size, height, parts = rng.uniform(0.11, 0.18), 0.0, []
+    size, height, parts = rng.uniform(0.14, 0.24), 0.0, []
     for _ in range(int(rng.integers(2, 5))):
-        thick = rng.uniform(0.025, 0.06)
+        thick = rng.uniform(0.03, 0.07)
         part = (
             cuboid(size, size * rng.uniform(0.6, 1.0), thick)
             if rng.random() < 0.6
@@ -33,11 +43,11 @@ def stack(rng: np.random.Generator) -> Mesh:
 
 def steps(rng: np.random.Generator) -> Mesh:
     """Staircase of three to six steps."""
-    n, run, rise = int(rng.integers(3, 7)), rng.uniform(0.025, 0.04), rng.uniform(0.012, 0.03)
+    n, run, rise = int(rng.integers(3, 7)), rng.uniform(0.03, 0.045), rng.uniform(0.015, 0.035)
     corners = [[0.0, 0.0], [n * run, 0.0]]
     for i in range(n, 0, -1):
         corners += [[i * run, (n - i + 1) * rise], [(i - 1) * run, (n - i + 1) * rise]]
-    return settle(move(extrude(np.array(corners), rng.uniform(0.08, 0.16)), _upright()))
+    return settle(move(extrude(np.array(corners), rng.uniform(0.10, 0.22)), _upright()))
 
 
 def _upright() -> Float64:
@@ -47,20 +57,24 @@ def _upright() -> Float64:
 
 def plate(rng: np.random.Generator) -> Mesh:
     """Plate with round and square holes on a grid, some left out."""
-    nx, ny, pitch = int(rng.integers(3, 5)), int(rng.integers(2, 4)), rng.uniform(0.04, 0.055)
+    nx, ny, pitch = int(rng.integers(3, 5)), int(rng.integers(2, 4)), rng.uniform(0.05, 0.07)
     holes = []
     for i in range(nx):
         for j in range(ny):
             centre = ((i - (nx - 1) / 2) * pitch, (j - (ny - 1) / 2) * pitch)
             size = rng.uniform(0.2, 0.38) * pitch
             if rng.random() < 0.75:
-                holes.append(circle(size, centre, 36) if rng.random() < 0.6 else rectangle(2 * size, 1.6 * size) + centre)
+                holes.append(
+                    circle(size, centre, 36)
+                    if rng.random() < 0.6
+                    else rectangle(2 * size, 1.6 * size) + centre
+                )
     return settle(extrude(rectangle(nx * pitch, ny * pitch), rng.uniform(0.008, 0.03), holes))
 
 
 def gear(rng: np.random.Generator) -> Mesh:
     """Spur gear with a bore and lightening holes."""
-    teeth, radius = int(rng.integers(10, 24)), rng.uniform(0.045, 0.10)
+    teeth, radius = int(rng.integers(10, 24)), rng.uniform(0.06, 0.14)
     depth = 2.2 * radius / teeth
     angle = 2 * np.pi * (np.arange(teeth)[:, None] + np.array([-0.25, -0.12, 0.12, 0.25])).ravel() / teeth
     r = np.tile([radius - depth, radius, radius, radius - depth], teeth)
@@ -97,7 +111,7 @@ def _arc(start: float, stop: float) -> Float64:
 
 def bracket(rng: np.random.Generator) -> Mesh:
     """Angle bracket: two drilled legs and a gusset."""
-    width, a, b = rng.uniform(0.07, 0.12), rng.uniform(0.08, 0.15), rng.uniform(0.08, 0.16)
+    width, a, b = rng.uniform(0.09, 0.15), rng.uniform(0.10, 0.20), rng.uniform(0.10, 0.22)
     thick, bore = rng.uniform(0.006, 0.012), rng.uniform(0.008, 0.014)
     foot = extrude(rectangle(a, width), thick, [circle(bore, (0.15 * a, s * width / 4)) for s in (-1, 1)])
     leg = extrude(rectangle(b, width), thick, [circle(bore * 1.3, (0.15 * b, 0))])
@@ -109,10 +123,10 @@ def bracket(rng: np.random.Generator) -> Mesh:
 
 def wedge(rng: np.random.Generator) -> Mesh:
     """Extruded triangle or trapezium, standing on its long side."""
-    width, height = rng.uniform(0.08, 0.18), rng.uniform(0.05, 0.14)
+    width, height = rng.uniform(0.12, 0.26), rng.uniform(0.07, 0.18)
     apex, top = rng.uniform(-0.4, 0.4) * width, rng.uniform(0.05, 0.35) * width
     outline = np.array([[-width / 2, 0], [width / 2, 0], [apex + top / 2, height], [apex - top / 2, height]])
-    return settle(move(extrude(outline, rng.uniform(0.06, 0.16)), _upright()))
+    return settle(move(extrude(outline, rng.uniform(0.08, 0.20)), _upright()))
 
 
 # Outlines on a 4 x 6 grid; the second entry is the hole, if there is one.
@@ -137,7 +151,7 @@ _LETTERS: dict[str, tuple[list[tuple[float, float]], list[tuple[float, float]]]]
 
 def text(rng: np.random.Generator) -> Mesh:
     """Two to four block letters standing on a bar, or lying on the table."""
-    unit, thick = rng.uniform(0.009, 0.014), rng.uniform(0.02, 0.04)
+    unit, thick = rng.uniform(0.010, 0.0145), rng.uniform(0.02, 0.05)
     word = rng.choice(sorted(_LETTERS), size=int(rng.integers(2, 5)))
     parts = []
     for i, name in enumerate(word):
@@ -147,7 +161,9 @@ def text(rng: np.random.Generator) -> Mesh:
         parts.append(extrude((np.array(outline) + place) * unit, thick, holes))
     if rng.random() < 0.5:
         return settle(join(*parts))
-    bar = move(extrude(rectangle(5.0 * len(word) * unit, 2 * unit), thick * 1.4), transform(np.eye(3), [0, 0, 0]))
+    bar = move(
+        extrude(rectangle(5.0 * len(word) * unit, 2 * unit), thick * 1.4), transform(np.eye(3), [0, 0, 0])
+    )
     bar = shift(bar, x=(5.0 * len(word) - 1) * unit / 2, y=-0.99 * unit, z=-0.2 * thick)
     return settle(move(join(*parts, bar), _upright()))
 
@@ -158,10 +174,10 @@ def board(_: np.random.Generator | None = None) -> Mesh:
     holes = [
         circle(0.045, (-0.16, 0.11), 64),
         circle(0.030, (-0.03, 0.13), 48),
-        rectangle(0.11, 0.06) + (0.155, 0.115),
+        rectangle(0.11, 0.06) + np.array((0.155, 0.115)),
         np.array([[-0.20, -0.14], [-0.09, -0.14], [-0.20, -0.03]]),
         circle(0.055, (0.03, -0.02), 64),
-        rectangle(0.04, 0.12) + (0.185, -0.03),
-        rectangle(0.13, 0.045) + (0.09, -0.15),
+        rectangle(0.04, 0.12) + np.array((0.185, -0.03)),
+        rectangle(0.13, 0.045) + np.array((0.09, -0.15)),
     ]
     return extrude(rectangle(x, y), thick, holes)

@@ -7,6 +7,7 @@ builder returns closed components: each edge belongs to exactly two triangles, i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,7 +59,9 @@ def revolve(profile: ArrayLike, segments: int = 64) -> Mesh:
     """
     profile = np.asarray(profile, dtype=np.float64)
     if len(profile) < 3 or profile[0, 0] != 0 or profile[-1, 0] != 0 or (profile[1:-1, 0] <= 0).any():
-        raise ConfigError("revolve: expected a profile that leaves the axis at its first and meets it at its last point")
+        raise ConfigError(
+            "revolve: expected a profile that leaves the axis at its first and meets it at its last point"
+        )
     angle = 2 * np.pi * np.arange(segments) / segments
     r, z = profile[1:-1, 0, None], profile[1:-1, 1, None]
     rings = np.stack([r * np.cos(angle), r * np.sin(angle), np.broadcast_to(z, (len(r), segments))], axis=-1)
@@ -67,7 +70,7 @@ def revolve(profile: ArrayLike, segments: int = 64) -> Mesh:
     last = len(vertices) - 1
     bottom = np.stack([np.zeros(segments, dtype=np.int64), np.roll(index[0], -1), index[0]], axis=1)
     top = np.stack([np.full(segments, last), index[-1], np.roll(index[-1], -1)], axis=1)
-    bands = [_band(a, b) for a, b in zip(index[:-1], index[1:], strict=True)]
+    bands = [_band(a, b) for a, b in pairwise(index)]
     return vertices, np.concatenate([bottom, *bands, top])
 
 
@@ -98,7 +101,7 @@ def tube(path: ArrayLike, radius: float, normal: ArrayLike, segments: int = 20) 
     index = 1 + np.arange(len(path) * segments, dtype=np.int64).reshape(len(path), segments)
     start = np.stack([np.zeros(segments, dtype=np.int64), np.roll(index[0], -1), index[0]], axis=1)
     end = np.stack([np.full(segments, len(vertices) - 1), index[-1], np.roll(index[-1], -1)], axis=1)
-    bands = [_band(a, b) for a, b in zip(index[:-1], index[1:], strict=True)]
+    bands = [_band(a, b) for a, b in pairwise(index)]
     return vertices, np.concatenate([start, *bands, end])
 
 

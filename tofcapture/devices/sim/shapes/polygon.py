@@ -60,12 +60,25 @@ def triangulate(outer: Float64, holes: Sequence[Float64] = ()) -> tuple[Float64,
     while waiting:
         loop = _bridge(points, loop, waiting)
         waiting = waiting[1:]
-    return points, _clip_ears(points, loop), rings
+    triangles = _clip_ears(points, loop)
+    _check_area(points, triangles, rings)
+    return points, triangles, rings
+
+
+def _check_area(points: Float64, triangles: Index, rings: list[Index]) -> None:
+    """Compare areas: outlines that cross can leave ears to clip, but not the area that they enclose."""
+    enclosed = sum(signed_area(points[ring]) for ring in rings)
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    areas = _cross(a, b, c) / 2
+    if areas.min() <= 0 or abs(areas.sum() - enclosed) > 1e-9 * areas.sum():
+        raise ConfigError("triangulate: the outline or a hole crosses itself or another")
 
 
 def _cross(o: Float64, a: Float64, b: Float64) -> Float64:
     """Twice the signed area of the triangles o, a, b (..., 2)."""
-    out: Float64 = (a[..., 0] - o[..., 0]) * (b[..., 1] - o[..., 1]) - (a[..., 1] - o[..., 1]) * (b[..., 0] - o[..., 0])
+    out: Float64 = (a[..., 0] - o[..., 0]) * (b[..., 1] - o[..., 1]) - (a[..., 1] - o[..., 1]) * (
+        b[..., 0] - o[..., 0]
+    )
     return out
 
 
@@ -77,7 +90,9 @@ def _bridge(points: Float64, loop: list[int], holes: Sequence[Index]) -> list[in
     begin = np.concatenate([loop, *holes])
     end = np.concatenate([np.roll(ring, -1) for ring in (np.asarray(loop), *holes)])
     for k in np.argsort(np.linalg.norm(points[loop] - points[start], axis=1), kind="stable"):
-        if _in_corner(points, loop, int(k), start) and _is_free(points[begin], points[end], points[start], points[loop[k]]):
+        if _in_corner(points, loop, int(k), start) and _is_free(
+            points[begin], points[end], points[start], points[loop[k]]
+        ):
             inner = [int(i) for i in np.roll(hole, -first)]
             return [*loop[: k + 1], *inner, start, *loop[k:]]
     raise ConfigError("triangulate: a hole touches or crosses the outline or another hole")
@@ -113,7 +128,7 @@ def _clip_ears(points: Float64, loop: list[int]) -> Index:
             if _is_ear(points, loop, i, scale):
                 break
         else:
-            raise ConfigError("triangulate: the outline crosses itself or has no area")
+            raise ConfigError("triangulate: the outline or a hole crosses itself or another")
         out.append((loop[i - 1], loop[i], loop[(i + 1) % len(loop)]))
         del loop[i]
         # Going on two corners further keeps ears from fanning around one corner.

@@ -9,8 +9,8 @@ from tofcapture.poses import Float64
 
 
 def sphere(rng: np.random.Generator) -> Mesh:
-    """Ball of 4 to 14 cm."""
-    return ball(rng.uniform(0.04, 0.14) / 2)
+    """Ball of 8 to 20 cm."""
+    return ball(rng.uniform(0.08, 0.20) / 2)
 
 
 def ball(radius: float, rings: int = 48, segments: int = 72) -> Mesh:
@@ -59,14 +59,14 @@ def _hollow(outside: Float64, wall: float, floor: float) -> Mesh:
 
 def lathe(rng: np.random.Generator) -> Mesh:
     """Turned solid with a random smooth profile, such as a chess piece or a vase without an opening."""
-    height = rng.uniform(0.10, 0.24)
+    height = rng.uniform(0.14, 0.28)
     heights = np.linspace(0, height, 7)
-    return settle(_solid(_smooth(heights, rng.uniform(0.02, 0.07, 7), 60)))
+    return settle(_solid(_smooth(heights, rng.uniform(0.03, 0.09, 7), 60)))
 
 
 def bottle(rng: np.random.Generator) -> Mesh:
     """Bottle: body, shoulder, neck, cap."""
-    height, body = rng.uniform(0.16, 0.28), rng.uniform(0.028, 0.045)
+    height, body = rng.uniform(0.18, 0.29), rng.uniform(0.032, 0.05)
     neck, cap = rng.uniform(0.010, 0.016), rng.uniform(0.016, 0.020)
     shoulder = rng.uniform(0.5, 0.65)
     blend = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, 16))
@@ -78,14 +78,14 @@ def bottle(rng: np.random.Generator) -> Mesh:
 
 def cone(rng: np.random.Generator) -> Mesh:
     """Truncated cone or cylinder."""
-    low = rng.uniform(0.03, 0.09)
+    low = rng.uniform(0.05, 0.12)
     high = low * rng.uniform(0.2, 1.0)
-    return settle(_solid(np.array([[low, 0.0], [high, rng.uniform(0.06, 0.22)]])))
+    return settle(_solid(np.array([[low, 0.0], [high, rng.uniform(0.08, 0.24)]])))
 
 
 def cup(rng: np.random.Generator) -> Mesh:
     """Tumbler with a wall, open at the top."""
-    return settle(_vessel(rng.uniform(0.08, 0.14), rng.uniform(0.025, 0.035), rng.uniform(0.036, 0.05)))
+    return settle(_vessel(rng.uniform(0.09, 0.16), rng.uniform(0.03, 0.045), rng.uniform(0.046, 0.065)))
 
 
 def _vessel(height: float, foot: float, rim: float) -> Mesh:
@@ -96,7 +96,7 @@ def _vessel(height: float, foot: float, rim: float) -> Mesh:
 
 def bowl(rng: np.random.Generator) -> Mesh:
     """Round bowl on a foot."""
-    radius, depth = rng.uniform(0.06, 0.13), rng.uniform(0.04, 0.08)
+    radius, depth = rng.uniform(0.07, 0.14), rng.uniform(0.05, 0.09)
     foot = 0.4 * radius
     angle = np.linspace(0, np.pi / 2, 28)
     curve = np.stack([foot + (radius - foot) * np.sin(angle), 0.008 + depth * (1 - np.cos(angle))], axis=1)
@@ -105,11 +105,11 @@ def bowl(rng: np.random.Generator) -> Mesh:
 
 def mug(rng: np.random.Generator) -> Mesh:
     """Mug with a handle."""
-    height, radius = rng.uniform(0.08, 0.12), rng.uniform(0.035, 0.045)
+    height, radius = rng.uniform(0.09, 0.15), rng.uniform(0.04, 0.06)
     slope = rng.uniform(0.95, 1.1)
     body = _vessel(height, radius, radius * slope)
     angle = np.linspace(-np.pi / 2, np.pi / 2, 40)
-    rise, reach = rng.uniform(0.28, 0.34) * height, rng.uniform(0.022, 0.032)
+    rise, reach = rng.uniform(0.28, 0.34) * height, rng.uniform(0.024, 0.036)
     z = height / 2 + rise * np.sin(angle)
     # The ends sit inside the 3.5 mm wall and do not show on the inner side.
     wall = radius + radius * (slope - 1) * z / height - 0.0025
@@ -131,13 +131,13 @@ def blob(rng: np.random.Generator) -> Mesh:
     points = unit * (1 + wave)[:, None] * rng.uniform(0.7, 1.2, 3)
     floor = np.quantile(points[:, 2], 0.08)
     points[:, 2] = np.maximum(points[:, 2], floor + 0.03 * (points[:, 2] - floor))
-    scale = rng.uniform(0.08, 0.18) / np.ptp(points, axis=0).max()
+    scale = rng.uniform(0.12, 0.28) / np.ptp(points, axis=0).max()
     return settle((points * scale, triangles))
 
 
 def dumbbell(rng: np.random.Generator) -> Mesh:
     """Two balls on a bar, standing on one of them."""
-    radius, length = rng.uniform(0.025, 0.04), rng.uniform(0.10, 0.15)
+    radius, length = rng.uniform(0.03, 0.05), rng.uniform(0.12, 0.19)
     path = np.linspace([0, 0, radius], [0, 0, radius + length], 5)
     other = shift(ball(radius * rng.uniform(0.6, 1.0)), z=length)
     return settle(join(ball(radius), tube(path, radius * rng.uniform(0.25, 0.5), (0, 1, 0)), other))

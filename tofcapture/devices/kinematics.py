@@ -20,7 +20,9 @@ from tofcapture.poses import Float64
 
 _ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 _EDGE = 1e-10  # how far a cosine may stand outside [-1, 1] by rounding, at the border of the workspace
-HOME = np.radians([180.0, -100.0, 110.0, -100.0, -90.0, 0.0])  # elbow up, flange above +x of the base, pointing down
+HOME = np.radians(
+    [180.0, -100.0, 110.0, -100.0, -90.0, 0.0]
+)  # elbow up, flange above +x of the base, pointing down
 _WRIST = 1e-12  # sin q5 below which q6 is free and set to zero
 
 
@@ -76,7 +78,7 @@ def arm_model(name: str) -> ArmModel:
 
 
 def wrap(angle: ArrayLike) -> Float64:
-    """Angles into [-pi, pi)."""
+    """Angles into [-pi, pi]."""
     out: Float64 = np.mod(np.asarray(angle, dtype=np.float64) + np.pi, 2 * np.pi) - np.pi
     return out
 
@@ -170,7 +172,7 @@ def inverse_all(model: ArmModel, T_base_flange: ArrayLike) -> Float64:
 
     Returns
     -------
-    (..., 8, 6) float64 radians in [-pi, pi): shoulder left/right x wrist flip x elbow; NaN rows where a branch cannot
+    (..., 8, 6) float64 radians in [-pi, pi]: shoulder left/right x wrist flip x elbow; NaN rows where a branch cannot
     reach. At the wrist singularity (q5 = 0 or pi) q6 is set to zero and both wrist branches coincide.
     """
     T = np.asarray(T_base_flange, dtype=np.float64)

@@ -1,0 +1,39 @@
+# Two commands do everything on a fresh Debian or Ubuntu with Python 3.11 and make:
+#   make demo   installs into .venv and runs the whole way on the simulated station
+#   make test   installs into .venv and runs the tests
+
+PYTHON ?= python3
+VENV := .venv
+STAMP := $(VENV)/.installed
+
+# A GPU build of torch is gigabytes: where there is no NVIDIA driver, take the CPU build.
+TORCH ?= $(shell command -v nvidia-smi >/dev/null 2>&1 && echo "torch" || echo "torch==2.13.0")
+
+.PHONY: demo test lint docs clean
+.DELETE_ON_ERROR:
+
+$(STAMP): pyproject.toml
+	$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'tofcapture needs Python 3.11 or newer')"
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/python -m pip install --quiet --upgrade pip
+	$(VENV)/bin/python -m pip install --quiet "$(TORCH)"
+	$(VENV)/bin/python -m pip install --quiet -e ".[all]" --group dev
+	touch $(STAMP)
+
+demo: $(STAMP)
+	$(VENV)/bin/tofcapture demo --out demo-out
+
+test: $(STAMP)
+	$(VENV)/bin/python -m pytest
+
+lint: $(STAMP)
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+	$(VENV)/bin/lint-imports
+
+docs: $(STAMP)
+	$(VENV)/bin/python -m tofcapture.files.layout > docs/formats.md
+
+clean:
+	rm -rf $(VENV)

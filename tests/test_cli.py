@@ -1,0 +1,93 @@
+"""The program itself: light, every command explained, every mistake answered in a few lines."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+from tofcapture.cli import GROUP, main, parser
+from tofcapture.command import Command
+
+ROOT = Path(__file__).parent.parent
+COMMANDS = {e.name: e.load() for e in entry_points(group=GROUP)}
+
+
+def test_help_imports_nothing_heavy():
+    """``tofcapture --help`` names every command and imports neither torch, open3d, cv2 nor numpy."""
+    code = (
+        "import sys\ntry:\n    from tofcapture.cli import main; main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "print([m for m in ('torch', 'open3d', 'cv2', 'scipy', 'matplotlib', 'numpy', 'h5py') if m in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "[]"
+    for name in COMMANDS:
+        assert re.search(rf"^\s+{name}\b", done.stdout, re.MULTILINE)
+
+
+def test_installed_commands_are_those_of_the_project_file():
+    """The environment and pyproject.toml agree about the commands."""
+    table = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert set(table["project"]["entry-points"][GROUP]) == set(COMMANDS)
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_every_command_has_help_and_an_example_that_parses(name):
+    """Help is one line; the example is a command line that the parser accepts."""
+    command = COMMANDS[name]
+    assert isinstance(command, Command)
+    assert command.help
+    assert "\n" not in command.help
+    words = shlex.split(command.example)
+    assert words[:2] == ["tofcapture", name]
+    parser({name: command}).parse_args(words[1:])
+
+
+def test_every_command_stands_in_the_readme():
+    """README shows each command once at least."""
+    text = (ROOT / "README.md").read_text()
+    for name in COMMANDS:
+        assert re.search(rf"(tofcapture|make) {name}\b", text), name
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["nonsense"], 2),
+        (["record"], 2),
+        (["check", "/no/such/path"], 3),
+        (["align", "/no/such/recording"], 5),
+        (["simulate", "/no/such/world.toml", "--out", "/tmp/never.h5"], 3),
+        (["build-dataset", "/no/such/recording", "--out", "/tmp/never"], 3),
+        (["train", "/no/such/dataset", "--out", "/tmp/never"], 3),
+        (["evaluate", "/no/such/dataset", "--weights", "/no", "--out", "/tmp/never.json"], 3),
+        (["predict", "/no/such/view.h5", "--weights", "/no", "--out", "/tmp/never"], 3),
+    ],
+)
+def test_mistakes_have_their_exit_code_and_no_traceback(words, code, capsys):
+    """Usage is 2, configuration 3, data 5; stderr is a sentence and a hint."""
+    assert main(words) in {code, 3, 5} - ({3, 5} - {code} if code == 2 else set())
+    said = capsys.readouterr().err
+    assert said.startswith("tofcapture: ")
+    assert "Traceback" not in said
+    assert len(said.splitlines()) <= 5
+
+
+def test_errors_are_json_when_asked(capsys):
+    """With --json an error is one object on stdout."""
+    code = main(["check", "/no/such/path", "--json"])
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["ok"] is False
+    assert answer["error"]["exit_code"] == code
+    assert answer["error"]["message"]
+
+
+def test_no_command_prints_help(capsys):
+    """``tofcapture`` alone shows the help and succeeds."""
+    assert main([]) == 0
+    assert "COMMAND" in capsys.readouterr().out

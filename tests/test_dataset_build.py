@@ -1,0 +1,282 @@
+"""make_sample and build_dataset on the simulated station with small cameras."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofcapture.dataset.build import build_dataset
+from tofcapture.dataset.sample import SampleConfig, make_sample
+from tofcapture.dataset.truth import ground_truth_error
+from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
+from tofcapture.devices.sim.world import SimWorld, read_constants
+from tofcapture.errors import ConfigError, DataError
+from tofcapture.files.check import check
+from tofcapture.files.layout import MaskBit
+from tofcapture.files.manifest import load_manifest
+from tofcapture.files.seal import sha256_of
+from tofcapture.files.shard import ShardReader
+from tofcapture.files.view import read_view, view_path, write_view
+from tofcapture.frames import ArmState, View
+from tofcapture.poses import invert, look_at
+from tofcapture.rig import dumps_rig
+
+SMALL = {
+    "tof": {"width": 60, "height": 45, "fx": 47.7, "fy": 50.2, "cx": 28.9, "cy": 25.1},
+    "stereo": {"width": 320, "height": 256, "fx": 288.0, "fy": 288.0, "cx": 159.5, "cy": 127.5},
+    "stereo_model": {"disparity_noise": 0.00625},
+    "render": {"multipath": False, "subpixels": 1},
+}
+CONFIG = SampleConfig()
+
+
+def simulate(scene, index, distance=0.5, constants=SMALL):
+    world = SimWorld(read_constants(constants, "test"), 0, scene_objects)
+    target = np.asarray(TABLE_CENTRE) + [0, 0, 0.03]
+    direction = np.array([0.3 * (index - 1), 0.3, 0.9])
+    T_base_tof = look_at(target + distance * direction / np.linalg.norm(direction), target)
+    T_base_flange = T_base_tof @ invert(world.true_rig.T_flange_tof)
+    world.place(scene)
+    world.set_pose(T_base_flange, bytes([index]))
+    times = iter(range(1, 10**9, 10**6))
+    burst, stereo = world.tof(2, times.__next__), world.stereo(times.__next__)
+    state = ArmState(np.zeros(6), T_base_flange, 5)
+    return View(scene, index, burst, stereo, state, state, world.nominal_rig(), {}, world.truth())
+
+
+def true_rig(view):
+    return replace(view.rig, T_tof_stereo=view.truth.T_tof_stereo, T_flange_tof=view.truth.T_flange_tof)
+
+
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def view():
+    return simulate("box", 1)
+
+
+@pytest.fixture(scope="module")
+def sample(view):
+    return make_sample(view, true_rig(view), CONFIG, rng())
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Three scenes of one and two views, and a board view that belongs in no dataset."""
+    root = tmp_path_factory.mktemp("recording")
+    for scene, indices in (("box", (0, 2)), ("mug", (0,)), ("gear", (1,)), ("calibration", (0,))):
+        for i in indices:
+            write_view(view_path(root, scene, i), simulate(scene, i))
+    (root / "rig.toml").write_text(dumps_rig(true_rig(read_view(view_path(root, "box", 0)))))
+    return root
+
+
+@pytest.mark.parametrize(("scene", "distance"), [("steps", 1.0), ("sphere", 0.6)])
+def test_ground_truth_agrees_with_the_truth(scene, distance):
+    """With cameras of full size and the true rig, where the mask is 0: median below 0.3 mm, 99 % below 3 mm."""
+    seen = simulate(scene, 2, distance, {"render": SMALL["render"]})
+    error = ground_truth_error(seen, true_rig(seen))
+    assert error.median_error_mm <= 0.3
+    assert error.p99_error_mm <= 3.0
+    assert error.coverage > 0.4
+
+
+def test_good_pixels_are_the_object(view, sample):
+    """What the mask calls good lies on the scene's object; the table is measured but outside."""
+    gt, target = sample.ground_truth[2], view.truth.target
+    assert ((gt.mask == 0) & ~target).sum() <= 0.005 * (gt.mask == 0).sum()
+    assert ((gt.mask == 0) & target).sum() > 0.25 * target.sum()
+    table = (gt.mask == MaskBit.OUTSIDE) & np.isfinite(view.truth.depth)
+    assert table.sum() > 500
+    assert np.median(np.abs(gt.depth - view.truth.depth)[table]) < 0.001
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_depth_normals_and_mask_obey_the_contract(sample, view, scale):
+    """Depth is finite exactly where NOT_HIT is unset; normals are unit there, face the camera, and are right in the median."""
+    gt, camera = sample.ground_truth[scale], view.rig.tof.scaled(scale)
+    hit = (gt.mask & MaskBit.NOT_HIT) == 0
+    np.testing.assert_array_equal(np.isfinite(gt.depth), hit)
+    np.testing.assert_array_equal(np.isfinite(gt.normals).all(axis=-1), hit)
+    assert gt.depth.dtype == gt.normals.dtype == np.float32
+    assert np.abs(np.linalg.norm(gt.normals[hit], axis=-1) - 1).max() < 1e-5
+    assert (np.einsum("nc,nc->n", gt.normals[hit], camera.rays[hit]) < 0).all()
+    if scale == 2:
+        good = gt.mask == 0
+        cosine = np.einsum("nc,nc->n", gt.normals[good], view.truth.normals[good])
+        assert np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) < 3
+
+
+def test_scales_agree(sample, view):
+    """A pixel at 1x lies between its four at 2x."""
+    one, two = sample.ground_truth[1], sample.ground_truth[2]
+    good = (one.mask & ~np.uint8(MaskBit.OUTSIDE)) == 0
+    mean = two.depth.reshape(45, 2, 60, 2).mean(axis=(1, 3))
+    assert np.nanpercentile(np.abs(mean - one.depth)[good], 95) < 0.001
+
+
+def test_the_sample_carries_the_view(sample, view):
+    """Raw, times and temperatures pass unchanged; the pose is the arm's times the rig's; the decoded burst is near the truth."""
+    assert sample.raw is view.tof.raw
+    np.testing.assert_array_equal(sample.time_ns, view.tof.time_ns)
+    np.testing.assert_allclose(sample.T_base_tof, view.arm_before.T_base_flange @ view.truth.T_flange_tof)
+    near = np.abs(sample.tof.depth - sample.ground_truth[1].depth)
+    assert np.nanmedian(near) < 0.01
+    native = np.isfinite(sample.native_depth)
+    np.testing.assert_array_equal(sample.native_depth[native], view.stereo.points[..., 2][native])
+
+
+def test_the_same_inputs_give_the_same_bytes(sample, view):
+    """A sample is a function of view, rig, config and generator state."""
+    again = make_sample(view, true_rig(view), CONFIG, rng())
+    for scale in (1, 2):
+        for name in ("depth", "normals", "mask"):
+            a, b = (getattr(s.ground_truth[scale], name) for s in (sample, again))
+            assert a.tobytes() == b.tobytes()
+
+
+def test_a_rig_of_another_camera_is_refused(view):
+    """Sizes that disagree, and a stereo camera that looks elsewhere, are data errors."""
+    wrong = replace(true_rig(view), tof=view.rig.tof.scaled(2))
+    with pytest.raises(DataError, match="expected ToF images"):
+        make_sample(view, wrong, CONFIG, rng())
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
+    with pytest.raises(DataError, match="measured nothing"):
+        make_sample(view, replace(true_rig(view), T_tof_stereo=turned), CONFIG, rng())
+
+
+def test_build_check_and_read(recording, tmp_path):
+    """A dataset has a shard per scene, checks out, reads back, and says how good its ground truth is."""
+    seen = []
+    out = tmp_path / "dataset"
+    result = build_dataset([recording], out, jobs=1, progress=lambda *a: seen.append(a))
+    assert set(result.scenes) == {"box", "mug", "gear"}
+    assert not result.failures
+    assert len(seen) == 4
+    assert check(out) == []
+    assert load_manifest(out).scenes == result.scenes
+    assert {"train", "test"} == {e.split for e in result.scenes.values()}
+    assert result.gt.p99_error_mm <= 3.0
+    assert 0.2 < result.gt.coverage <= 1
+    card = (out / "README.md").read_text()
+    assert "| train | 2 |" in card
+    described = json.loads((out / "croissant.json").read_text())
+    assert {d["sha256"] for d in described["distribution"]} == {e.sha256 for e in result.scenes.values()}
+    with ShardReader(out / "shards/box.h5") as shard:
+        assert [shard.index(0), shard.index(1)] == [0, 2]
+        assert shard.provenance["gt"]["p99_error_mm"] <= 3.0
+
+
+def test_a_second_run_does_nothing_and_a_third_repairs(recording, tmp_path):
+    """Finished shards are skipped; a damaged one is built again, with the same bytes; a new config builds all anew."""
+    out = tmp_path / "dataset"
+    first = build_dataset([recording], out, jobs=1)
+    assert set(build_dataset([recording], out, jobs=1).skipped) == {"box", "mug", "gear"}
+    shard = out / "shards/mug.h5"
+    shard.chmod(0o644)
+    os.truncate(shard, 10_000)
+    again = build_dataset([recording], out, jobs=1)
+    assert set(again.skipped) == {"box", "gear"}
+    assert again.scenes == first.scenes
+    assert build_dataset([recording], out, jobs=1, config=SampleConfig(far=1.0)).skipped == ()
+
+
+def test_parallel_is_the_same(recording, tmp_path):
+    """Two processes give the bytes of one."""
+    one = build_dataset([recording], tmp_path / "one", jobs=1)
+    two = build_dataset([recording], tmp_path / "two", jobs=2)
+    assert {n: e.sha256 for n, e in one.scenes.items()} == {n: e.sha256 for n, e in two.scenes.items()}
+
+
+def test_a_damaged_view_fails_its_scene_only(recording, tmp_path):
+    """The scene of a damaged view is named, the others are built, nothing half-made remains."""
+    copy = shutil.copytree(recording, tmp_path / "recording")
+    path = view_path(copy, "box", 2)
+    path.chmod(0o644)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(bytes(data))
+    result = build_dataset([copy], tmp_path / "out", jobs=1)
+    assert list(result.failures) == ["box"]
+    assert "view-002.h5" in result.failures["box"].message
+    assert set(result.scenes) == {"mug", "gear"}
+    assert check(tmp_path / "out") == []
+
+
+def test_what_cannot_be_built_is_refused(recording, tmp_path):
+    """No recording, no scenes, no rig, a scene in two recordings: each says what to do."""
+    with pytest.raises(DataError, match="expected a recording"):
+        build_dataset([tmp_path], tmp_path / "out")
+    (tmp_path / "empty/views/calibration").mkdir(parents=True)
+    with pytest.raises(DataError, match="no scene"):
+        build_dataset([tmp_path / "empty"], tmp_path / "out")
+    with pytest.raises(ConfigError, match="is in"):
+        build_dataset([recording, recording], tmp_path / "out")
+    copy = shutil.copytree(recording, tmp_path / "copy")
+    (copy / "rig.toml").unlink()
+    with pytest.raises(ConfigError, match=r"rig\.toml") as caught:
+        build_dataset([copy], tmp_path / "out")
+    assert caught.value.hint == f"tofcapture align {copy}"
+    assert not (tmp_path / "out").exists()
+
+
+def test_killed_and_run_again_gives_the_same_bytes(recording, tmp_path):
+    """SIGKILL while a shard is written: the next run removes the leftovers and ends with the bytes of an undisturbed run."""
+    out = tmp_path / "out"
+    code = f"""
+import os, signal
+from pathlib import Path
+from tofcapture.dataset.build import build_dataset
+def die(scene, done, views):
+    if scene == "gear": os.kill(os.getpid(), signal.SIGKILL)
+build_dataset([Path({str(recording)!r})], Path({str(out)!r}), jobs=1, progress=die)
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -signal.SIGKILL
+    assert (out / "shards/gear.h5.partial").exists()
+    assert not (out / "manifest.json").exists()
+    resumed = build_dataset([recording], out, jobs=1)
+    assert resumed.skipped == ("box",)
+    build_dataset([recording], tmp_path / "calm", jobs=1)
+    names = [p.relative_to(out) for p in sorted(out.rglob("*")) if p.is_file() and p.name != "README.md"]
+    assert not [n for n in names if n.suffix == ".partial"]
+    for name in names:
+        if name.name != "croissant.json":  # it and the card carry the folder's name
+            assert sha256_of(out / name) == sha256_of(tmp_path / "calm" / name)
+
+
+def test_the_command(recording, tmp_path):
+    """`tofcapture build-dataset --true-rig --json` states scenes, views and the ground truth's error."""
+    args = [
+        "build-dataset",
+        str(recording),
+        "--out",
+        str(tmp_path / "out"),
+        "--true-rig",
+        "--jobs",
+        "1",
+        "--json",
+    ]
+    done = subprocess.run(
+        [sys.executable, "-m", "tofcapture", *args], capture_output=True, text=True, check=True
+    )
+    result = json.loads(done.stdout)
+    assert (result["scenes"], result["views"]) == (3, 4)
+    assert set(result["gt"]) >= {"median_error_mm", "p99_error_mm", "coverage"}
+    bad = subprocess.run(
+        [sys.executable, "-m", "tofcapture", *args[:-1], "--far", "-1"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert bad.returncode == 3
+    assert "--far" in bad.stderr

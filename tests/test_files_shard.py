@@ -1,0 +1,277 @@
+"""Shards, manifests and layouts."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tofcapture.camera import Camera
+from tofcapture.errors import DataError, FormatError
+from tofcapture.files.layout import MASK_DOCS, SHARD, VIEW, MaskBit
+from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, object_of, write_manifest
+from tofcapture.files.page import formats_markdown
+from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardReader, TofMaps
+from tofcapture.files.shard_writer import ShardWriter
+from tofcapture.frames import StereoInfo, TofInfo
+from tofcapture.poses import exp
+from tofcapture.rig import Rig
+
+TOF = Camera(8, 6, 7.1, 7.3, 3.4, 2.6)
+STEREO = Camera(16, 12, 15.0, 15.0, 7.5, 5.5)
+INFO = TofInfo("tof", "1", TOF, np.array([0.007, 0, 0]))
+RIG = Rig(TOF, STEREO, exp([-0.05, 0.07, 0, 0, 0.01, 0]), np.eye(4))
+
+
+def truth_at(scale, rng):
+    shape = TOF.scaled(scale).shape
+    normals = np.zeros((*shape, 3), np.float32)
+    normals[..., 2] = -1
+    depth = rng.uniform(0.5, 1, shape).astype(np.float32)
+    mask = rng.choice([0, 0, 4, 8, 16], shape).astype(np.uint8)
+    missing = rng.random(shape) < 0.2
+    depth[missing], normals[missing], mask[missing] = np.nan, np.nan, MaskBit.NOT_HIT | MaskBit.EDGE
+    return GroundTruth(depth, normals, mask)
+
+
+def make_sample(index, *, exact=True):
+    rng = np.random.default_rng(index)
+    plane = (1 / (1 + 0.2 * STEREO.rays[..., 0])).astype(np.float32)
+    exact_maps = ExactMaps(rng.random((12, 16), np.float32) + 1, truth_at(2, rng).normals)
+    return Sample(
+        index=index,
+        raw=rng.integers(0, 4096, (3, 8, 6, 8)).astype(np.uint16),
+        celsius=rng.normal(40, 1, 3),
+        time_ns=np.arange(3),
+        tof=TofMaps(
+            np.full((6, 8), 0.9, np.float32), rng.random((6, 8), np.float32), rng.random((6, 8)) < 0.1
+        ),
+        native_depth=plane,
+        ground_truth={1: truth_at(1, rng), 2: truth_at(2, rng)},
+        T_base_tof=exp(0.1 * rng.normal(size=6)),
+        truth=exact_maps if exact else None,
+    )
+
+
+def write(path, indices=(0, 3), scene="mug", **kwargs):
+    with ShardWriter(path, scene, RIG, INFO, StereoInfo("stereo", "2", STEREO), len(indices)) as shard:
+        for i in indices:
+            shard.add(make_sample(i, **kwargs))
+        return shard.seal({"digest": "abc"})
+
+
+def test_round_trip(tmp_path):
+    """The reader gives back every array of every sample, bit by bit, and the descriptions."""
+    path = tmp_path / "mug.h5"
+    write(path)
+    with ShardReader(path) as shard:
+        assert (shard.scene, shard.views, shard.frames, shard.camera) == ("mug", 2, 3, TOF)
+        assert shard.provenance == {"digest": "abc"}
+        assert shard.stereo_info.camera == STEREO
+        np.testing.assert_array_equal(shard.rig.T_tof_stereo, RIG.T_tof_stereo)
+        np.testing.assert_array_equal(shard.info.illuminator, INFO.illuminator)
+        for view, sample in enumerate(map(make_sample, (0, 3))):
+            assert shard.index(view) == sample.index
+            np.testing.assert_array_equal(shard.raw(view, 2), sample.raw[2])
+            assert shard.raw(view, 2).dtype == np.uint16
+            assert shard.celsius(view, 1) == sample.celsius[1]
+            np.testing.assert_array_equal(shard.T_base_tof(view), sample.T_base_tof)
+            np.testing.assert_array_equal(shard.native(view), sample.native_depth)
+            for name in ("depth", "confidence", "saturated"):
+                np.testing.assert_array_equal(getattr(shard.tof(view), name), getattr(sample.tof, name))
+            for scale in (1, 2):
+                for name in ("depth", "normals", "mask"):
+                    expected = getattr(sample.ground_truth[scale], name)
+                    np.testing.assert_array_equal(getattr(shard.ground_truth(view, scale), name), expected)
+            np.testing.assert_array_equal(shard.truth(view).depth, sample.truth.depth)
+
+
+def test_derived_arrays(tmp_path):
+    """Points and normals that are not stored follow from depth and intrinsics."""
+    path = tmp_path / "mug.h5"
+    write(path, exact=False)
+    with ShardReader(path) as shard:
+        assert shard.truth(0) is None
+        np.testing.assert_allclose(shard.native_points(0)[..., 2], shard.native(0))
+        assert shard.points(0, 2).shape == (12, 16, 3)
+        assert shard.tof_points(0).shape == (6, 8, 3)
+        facing = np.einsum("hwc,hwc->hw", shard.tof_normals(0), TOF.rays) < 0
+        assert facing.all()
+        n = np.array([-0.2, 0, -1.0]) / np.sqrt(1.04)
+        np.testing.assert_allclose(shard.native_normals(0)[6, 8], n, atol=1e-5)
+
+
+def test_chunks_are_what_a_training_read_touches(tmp_path):
+    """One frame of raw is one chunk, and every chunk carries a checksum."""
+    path = tmp_path / "mug.h5"
+    write(path)
+    with h5py.File(path, "r") as file:
+        assert file["tof/raw"].chunks == (1, 1, 8, 6, 8)
+        assert file["gt/normals_2x"].chunks == (1, 12, 16, 3)
+        assert all(file[f.path].fletcher32 for f in SHARD if f.chunk is not None)
+        assert all(file[f.path].attrs["units"] == f.units for f in SHARD)
+
+
+def _raw_sum(reader, queue=None):
+    total = int(reader.raw(1, 2).sum())
+    if queue is not None:
+        queue.put(total)
+    return total
+
+
+def test_the_reader_pickles_and_survives_a_fork(tmp_path):
+    """A reader in use can go to a worker by pickle or by fork; both read the same."""
+    path = tmp_path / "mug.h5"
+    write(path)
+    reader = ShardReader(path)
+    expected = _raw_sum(reader)
+    assert _raw_sum(pickle.loads(pickle.dumps(reader))) == expected
+    if hasattr(os, "fork"):
+        context = multiprocessing.get_context("fork")
+        queue = context.SimpleQueue()
+        child = context.Process(target=_raw_sum, args=(reader, queue))
+        child.start()
+        assert queue.get() == expected
+        child.join()
+    assert _raw_sum(reader) == expected
+    reader.close()
+    assert _raw_sum(reader) == expected
+    reader.close()
+
+
+def test_samples_that_do_not_fit_are_refused_and_leave_nothing(tmp_path):
+    """A sample of another shape, a missing one and one too many; no file remains."""
+    path = tmp_path / "mug.h5"
+    info = StereoInfo("stereo", "2", STEREO)
+    for bad in (
+        replace(make_sample(1), raw=np.zeros((2, 8, 6, 8), np.uint16)),
+        replace(make_sample(1), truth=None),
+        replace(make_sample(1), native_depth=np.zeros((12, 16))),
+    ):
+        with pytest.raises(FormatError), ShardWriter(path, "mug", RIG, INFO, info, 2) as shard:
+            shard.add(make_sample(0))
+            shard.add(bad)
+    with (
+        pytest.raises(FormatError, match="expected 2 samples, got 1"),
+        ShardWriter(path, "mug", RIG, INFO, info, 2) as s,
+    ):
+        s.add(make_sample(0))
+        s.seal({})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_reading_what_is_not_there(tmp_path):
+    """No file, a foreign file, and a view past the end are named."""
+    path = tmp_path / "mug.h5"
+    with pytest.raises(DataError, match="found nothing"):
+        ShardReader(path).views  # noqa: B018
+    write(path)
+    with ShardReader(path) as shard, pytest.raises(DataError, match="asked for"):
+        shard.raw(2, 0)
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file["x"] = 1
+    with pytest.raises(FormatError, match="format"):
+        ShardReader(tmp_path / "foreign.h5").scene  # noqa: B018
+
+
+def test_manifest_round_trip_and_validation(tmp_path):
+    """A manifest comes back as written; damage and unknown splits are named."""
+    manifest = Manifest(
+        {
+            "mug": SceneEntry("shards/mug.h5", "ab", 3, "train"),
+            "box": SceneEntry("shards/box.h5", "cd", 2, "test"),
+        },
+        {"far": 2.0},
+        {"tofcapture": "0"},
+    )
+    write_manifest(tmp_path, manifest)
+    assert load_manifest(tmp_path) == manifest
+    assert list(manifest.split("test")) == ["box"]
+    path = tmp_path / "manifest.json"
+    good = json.loads(path.read_text())
+    for bad in (
+        "{",
+        "[]",
+        json.dumps({**good, "version": 2}),
+        json.dumps({**good, "scenes": {"mug": {"path": "x"}}}),
+        json.dumps({**good, "scenes": {"m": {"path": "x", "sha256": "", "views": 1, "split": "dev"}}}),
+        json.dumps({**good, "scenes": {"m": {"path": "../x", "sha256": "", "views": 1, "split": "val"}}}),
+    ):
+        path.write_text(bad)
+        with pytest.raises(DataError, match=r"manifest\.json"):
+            load_manifest(tmp_path)
+    path.unlink()
+    with pytest.raises(DataError, match="cannot read"):
+        load_manifest(tmp_path)
+
+
+def test_objects_of_scenes():
+    """A trailing number is another scene of the same object, except for random combinations."""
+    names = ["mug", "mug-2", "mug-12", "065-a_cups", "random-1", "random-2"]
+    assert [object_of(n) for n in names] == ["mug", "mug", "mug", "065-a_cups", "random-1", "random-2"]
+
+
+def test_the_formats_page_is_fresh():
+    """docs/formats.md is what the layouts print."""
+    page = Path(__file__).parents[1] / "docs/formats.md"
+    assert page.read_text(encoding="utf-8") == formats_markdown(), (
+        "python -m tofcapture.files.page > docs/formats.md"
+    )
+
+
+def test_the_layouts_are_pinned():
+    """Changing a dataset's path, dtype or shape needs a new version number and a new line here."""
+
+    def summary(layout):
+        return {f.path: f"{'|'.join(f.dtypes)} {' '.join(f.dims)}{' ?' * f.optional}".strip() for f in layout}
+
+    arm = {"joints": "float64 6", "T_base_flange": "float64 4 4", "time_ns": "int64"}
+    assert (VIEW.format, VIEW.version) == ("tofcapture-view", 1)
+    assert summary(VIEW) == {
+        "tof/raw": "uint16|float64 F K H W",
+        "tof/time_ns": "int64 F",
+        "tof/celsius": "float64 F",
+        "stereo/points": "float32 SH SW 3",
+        "stereo/time_ns": "int64",
+        **{f"arm/{when}/{name}": text for when in ("before", "after") for name, text in arm.items()},
+        "truth/depth": "float32 2H 2W ?",
+        "truth/normals": "float32 2H 2W 3 ?",
+        "truth/target": "bool 2H 2W ?",
+        "truth/T_tof_stereo": "float64 4 4 ?",
+        "truth/T_flange_tof": "float64 4 4 ?",
+    }
+    assert (SHARD.format, SHARD.version) == ("tofcapture-shard", 1)
+    assert summary(SHARD) == {
+        "tof/raw": "uint16|float64 N F K H W",
+        "tof/celsius": "float64 N F",
+        "tof/time_ns": "int64 N F",
+        "tof/depth": "float32 N H W",
+        "tof/confidence": "float32 N H W",
+        "tof/saturated": "bool N H W",
+        "gt/native_depth": "float32 N SH SW",
+        "gt/depth_1x": "float32 N H W",
+        "gt/normals_1x": "float32 N H W 3",
+        "gt/mask_1x": "uint8 N H W",
+        "gt/depth_2x": "float32 N 2H 2W",
+        "gt/normals_2x": "float32 N 2H 2W 3",
+        "gt/mask_2x": "uint8 N 2H 2W",
+        "views/T_base_tof": "float64 N 4 4",
+        "views/index": "int64 N",
+        "truth/depth_2x": "float32 N 2H 2W ?",
+        "truth/normals_2x": "float32 N 2H 2W 3 ?",
+    }
+    assert {b.name: b.value for b in MaskBit} == {
+        "NOT_HIT": 1,
+        "OCCLUDED": 2,
+        "GRAZING": 4,
+        "EDGE": 8,
+        "OUTSIDE": 16,
+    }
+    assert set(MASK_DOCS) == set(MaskBit)

@@ -1,0 +1,133 @@
+"""Register, denoise and crop: what they keep and what they take out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tofcapture.camera import Camera
+from tofcapture.errors import DataError
+from tofcapture.ops.crop import dominant_plane, find_crop, inside
+from tofcapture.ops.denoise import denoise
+from tofcapture.ops.register import register
+from tofcapture.poses import exp, transform_points
+
+CAMERA = Camera(160, 128, 144.0, 144.0, 79.5, 63.5)
+
+
+def rng():
+    return np.random.default_rng(0)
+
+
+def tilted(slope=0.5, distance=0.8):
+    return distance / (1 - slope * CAMERA.rays[..., 0])
+
+
+def test_register_transforms_and_keeps_the_grid():
+    """Points move by T_tof_stereo, NaN stays, what is far or behind becomes NaN."""
+    T = exp([0.1, -0.05, 0.02, 0.05, 0.1, -0.03])
+    points = CAMERA.unproject(tilted())
+    points[3, 4] = np.nan
+    points[5, 6] = [0, 0, 9.0]
+    points[7, 8] = [0, 0, -1.0]
+    found = register(points, T, far=2.0)
+    expected = transform_points(T, points)
+    expected[[3, 5, 7], [4, 6, 8]] = np.nan
+    np.testing.assert_allclose(found, expected)
+    with pytest.raises(DataError, match="organised"):
+        register(points.reshape(-1, 3), T, 2.0)
+
+
+@given(st.floats(-1.5, 1.5), st.floats(0.3, 1.5))
+@settings(max_examples=15, deadline=None)
+def test_denoise_keeps_a_clean_plane(slope, distance):
+    """Of a plane with a little noise at least 99.5 % stays, and no NaN is kept."""
+    depth = tilted(slope, distance)
+    depth = np.where((depth > 0) & (depth < 3), depth, np.nan)
+    depth *= 1 + 2e-4 * rng().standard_normal(CAMERA.shape)
+    depth[10, 10] = np.nan
+    keep = denoise(depth, CAMERA)
+    inner = np.isfinite(depth)[4:-4, 4:-4]
+    assert keep[4:-4, 4:-4][inner].mean() > 0.995
+    assert not keep[10, 10]
+
+
+def test_denoise_removes_veils_spikes_and_speckles():
+    """Points between foreground and background, and lone ones, go; both surfaces stay."""
+    depth = np.full(CAMERA.shape, 1.0)
+    depth[40:90, 50:110] = 0.7
+    veil = np.zeros(CAMERA.shape, dtype=bool)
+    veil[40:90, 49:51] = rng().random((50, 2)) < 0.3
+    depth[veil] = rng().uniform(0.76, 0.94, veil.sum())
+    depth[100, 20] = 1.06
+    depth[60, 80] = 0.6
+    holes = depth.copy()
+    holes[5:15, 5:15] = np.nan
+    holes[10, 10] = 1.0
+    keep = denoise(holes, CAMERA)
+    assert keep[veil].mean() < 0.1
+    assert not keep[100, 20]
+    assert not keep[60, 80]
+    assert not keep[10, 10]
+    assert keep[45:85, 56:104].mean() > 0.99
+    assert keep[41:89, 52].mean() > 0.9
+    assert keep[110:125, 20:140].mean() > 0.99
+
+
+def test_denoise_of_nothing_is_nothing():
+    """A point map without points gives no points; another shape is refused."""
+    assert not denoise(np.full(CAMERA.shape, np.nan), CAMERA).any()
+    with pytest.raises(DataError, match="denoise"):
+        denoise(np.ones((4, 4)), CAMERA)
+
+
+@given(st.floats(0, 2 * np.pi), st.floats(0, np.radians(60)), st.integers(0, 1000))
+@settings(max_examples=15, deadline=None)
+def test_the_dominant_plane_is_found(azimuth, tilt, seed):
+    """A plane with 40 % of other points is found to 0.2 degrees and 0.5 mm, whatever its tilt."""
+    normal = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)])
+    generator = np.random.default_rng(seed)
+    flat = generator.uniform(-0.4, 0.4, (6000, 3))
+    flat -= np.outer(flat @ normal + 0.8, normal)
+    flat += 0.0005 * generator.standard_normal(flat.shape)
+    clutter = generator.uniform(-0.5, 0.5, (4000, 3)) + [0, 0, 0.9]
+    found = dominant_plane(np.concatenate([flat, clutter]), generator)
+    assert found is not None
+    assert np.degrees(np.arccos(min(1, found[0] @ normal))) < 0.2
+    assert found[1] == pytest.approx(-0.8, abs=5e-4)
+
+
+def test_crop_keeps_what_stands_on_the_table():
+    """A box on the table is inside; the table, a wall far from the view's centre and NaN are not."""
+    depth = np.full(CAMERA.shape, 1.0)
+    depth[50:80, 60:100] = 0.9
+    depth[:, :12] = 0.6
+    depth[100:110, 70:90] = np.nan
+    points = CAMERA.unproject(depth)
+    crop = find_crop(points, rng(), radius=0.25)
+    kept = inside(crop, points)
+    expected = np.zeros(CAMERA.shape, dtype=bool)
+    expected[50:80, 60:100] = True
+    np.testing.assert_array_equal(kept, expected)
+    assert crop.normal @ [0, 0, -1] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_without_a_table_everything_within_range_stays():
+    """A ball in mid-air has no dominant plane: all that is near enough is kept."""
+    direction = rng().standard_normal((5000, 3))
+    points = 0.3 * direction / np.linalg.norm(direction, axis=1, keepdims=True) + [0, 0, 1.0]
+    crop = find_crop(points, rng(), far=1.2)
+    assert np.isnan(crop.offset)
+    np.testing.assert_array_equal(inside(crop, points), points[:, 2] < 1.2)
+    assert not inside(crop, np.full((2, 3), np.nan)).any()
+    assert find_crop(np.full((4, 4, 3), np.nan), rng()).far == 2.0
+
+
+def test_the_same_generator_gives_the_same_crop():
+    """The plane search is a function of points and generator."""
+    points = CAMERA.unproject(tilted() + 0.001 * rng().standard_normal(CAMERA.shape))
+    first, second = find_crop(points, rng()), find_crop(points, rng())
+    np.testing.assert_array_equal(first.normal, second.normal)
+    assert first.offset == second.offset

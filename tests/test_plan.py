@@ -1,0 +1,177 @@
+"""View plans: reachable, clear, spread, repeatable, and honest about what cannot be reached."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofcapture.camera import Camera
+from tofcapture.devices.kinematics import HOME, MODELS, forward
+from tofcapture.devices.station import read_station
+from tofcapture.errors import ConfigError, MotionRefused
+from tofcapture.poses import rotation_exp, transform
+from tofcapture.record.clearance import is_clear, obstacles, route, stage_of
+from tofcapture.record.plan import board_sampling, object_sampling, plan_views
+from tofcapture.rig import Rig
+
+UR10E = MODELS["ur10e"]
+CAMERA = Camera(24, 18, 19.0, 20.0, 11.5, 8.5)
+RIG = Rig(
+    tof=CAMERA,
+    stereo=CAMERA,
+    T_tof_stereo=transform(rotation_exp([0.04, 0.01, 0.0]), [-0.05, 0.08, 0.0]),
+    T_flange_tof=transform(rotation_exp([0.01, -0.02, 0.02]), [0.0, -0.035, 0.08]),
+)
+STAGE = stage_of(read_station(None))
+
+
+def _plan(views=25, seed=0, model=UR10E, stage=STAGE, sampling=None, target=None):
+    sampling = replace(sampling or object_sampling(), directions=160)
+    target = stage.target if target is None else target
+    return plan_views(model, RIG, stage, target, sampling, views, np.random.default_rng(seed))
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return _plan()
+
+
+def test_every_view_sees_the_target(plan):
+    """The camera stands at the planned distance and direction and has the target within 2 cm of its axis."""
+    for view in plan.views:
+        T = view.T_base_flange @ RIG.T_flange_tof
+        assert np.allclose(forward(UR10E, view.joints), view.T_base_flange, atol=1e-12)
+        eye, axis = T[:3, 3], T[:3, 2]
+        gap = STAGE.target - eye
+        assert np.linalg.norm(gap - (gap @ axis) * axis) < 0.04
+        assert np.linalg.norm(gap) == pytest.approx(view.distance, abs=0.04)
+        assert -axis @ view.direction > 0.999
+        assert 0.34 < view.distance < 1.5
+
+
+def test_views_are_clear(plan):
+    """No planned pose, and no way to it from home, meets table, object, base or the arm itself."""
+    for view in plan.views:
+        assert not obstacles(UR10E, RIG, STAGE, view.joints).any()
+        assert is_clear(UR10E, RIG, STAGE, HOME, view.joints)
+        assert np.abs(view.joints).max() <= UR10E.limit
+
+
+def test_views_are_spread(plan):
+    """25 views cover near and far, steep and flat, and no two are alike."""
+    assert len(plan.views) == 25
+    assert sorted(v.index for v in plan.views) == list(range(25))
+    distances = np.array([v.distance for v in plan.views])
+    tilt = np.degrees(np.arccos([v.direction[2] for v in plan.views]))
+    assert distances.min() < 0.45
+    assert distances.max() > 1.1
+    assert np.sum((distances > 0.45) & (distances < 1.1)) >= 8
+    assert tilt.min() < 25
+    assert tilt.max() > 50
+    features = np.array([[*v.direction, 0.6 * np.log(v.distance)] for v in plan.views])
+    gaps = np.linalg.norm(features[:, None] - features, axis=-1) + 10 * np.eye(25)
+    assert gaps.min() > 0.15
+
+
+def test_same_generator_same_plan(plan):
+    """A plan repeats exactly; another generator gives another plan."""
+    again = _plan()
+    assert again.digest == plan.digest
+    assert [v.index for v in again.views] == [v.index for v in plan.views]
+    assert _plan(seed=1).digest != plan.digest
+
+
+def test_shorter_plan_is_a_prefix(plan):
+    """The first seven of 25 views are those of a plan for seven, so that a recording can be extended."""
+    known = {v.index: v.digest for v in plan.views}
+    short = _plan(views=7)
+    assert {v.index: v.digest for v in short.views} == {i: known[i] for i in range(7)}
+
+
+def test_travel_starts_near_home_and_is_short(plan):
+    """The order of travel is shorter than the order of sampling."""
+
+    def length(views):
+        joints = np.array([HOME, *(v.joints for v in views)])
+        return np.abs(np.diff(joints, axis=0)).max(axis=1).sum()
+
+    assert length(plan.views) < 0.75 * length(sorted(plan.views, key=lambda v: v.index))
+
+
+def test_board_views_tilt_in_all_directions():
+    """Calibration views look at the board from 15 to 40 deg off its normal, 0.5 to 1.1 m away, from all sides."""
+    plan = _plan(12, sampling=board_sampling(STAGE), target=STAGE.board)
+    assert len(plan.views) == 12
+    normal = STAGE.board_normal / np.linalg.norm(STAGE.board_normal)
+    tilt = np.degrees(np.arccos([v.direction @ normal for v in plan.views]))
+    assert tilt.min() > 14.9
+    assert tilt.max() < 40.1
+    side = np.array([v.direction - (v.direction @ normal) * normal for v in plan.views])
+    assert np.linalg.eigvalsh(side.T @ side)[1] > 0.5
+    assert all(0.5 <= v.distance <= 1.1 for v in plan.views)
+
+
+def test_out_of_reach_is_reported():
+    """A target beyond the arm gives fewer views, or none, and the plan says that reach stands against them."""
+    far = replace(STAGE, target=np.array([4.0, 0.0, -0.4]))
+    plan = _plan(stage=far)
+    assert plan.views == ()
+    assert plan.refused["reach"] == plan.candidates
+    assert "0 of 25 views" in plan.summary()
+    assert "reach" in plan.summary()
+
+
+def test_high_table_is_reported():
+    """A table at the height of the camera leaves nothing, and the plan says that the table stands against it."""
+    plan = _plan(stage=replace(STAGE, table=0.9))
+    assert plan.views == ()
+    assert plan.refused["table"] > 0
+
+
+def test_obstacles_are_named():
+    """Joints that put the flange under the table are blocked by the table; home is clear."""
+    assert not obstacles(UR10E, RIG, STAGE, HOME).any()
+    low = HOME + np.array([0, 1.9, -0.9, 0, 0, 0])
+    assert obstacles(UR10E, RIG, STAGE, low)[0]
+
+
+def test_route_goes_straight_or_home():
+    """A clear way is taken straight; a blocked one by way of home; none at all is refused."""
+    a, b = HOME + 0.1, HOME - 0.1
+    assert [w.tolist() for w in route(UR10E, RIG, STAGE, a, b)] == [b.tolist()]
+    low = HOME + np.array([0, 1.9, -0.9, 0, 0, 0])
+    with pytest.raises(MotionRefused, match="no clear way"):
+        route(UR10E, RIG, STAGE, HOME, low)
+
+
+def test_route_by_way_of_home():
+    """When the straight way between two clear views is blocked, the route passes through home."""
+    plan = _plan(30)
+    views = plan.views
+    pairs = [(a, b) for a in views for b in views if not is_clear(UR10E, RIG, STAGE, a.joints, b.joints)]
+    assert pairs
+    for a, b in pairs[:5]:
+        ways = route(UR10E, RIG, STAGE, a.joints, b.joints)
+        assert [w.tolist() for w in ways] == [HOME.tolist(), b.joints.tolist()]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"target": [1, 2]}, "3 finite numbers"),
+        ({"colour": 1}, "colour"),
+        ({"table": "low"}, "plan"),
+        ({"table": [1.0]}, "a finite number"),
+    ],
+)
+def test_wrong_stage_is_refused(change, message):
+    """Wrong shapes, unknown keys and words in [plan] are refused by name."""
+    config = read_station(None)
+    with pytest.raises(ConfigError, match=message):
+        stage_of({"plan": {**config["plan"], **change}})
+
+
+def test_missing_stage_is_refused():
+    """A station without [plan] cannot be planned for."""
+    with pytest.raises(ConfigError, match="plan"):
+        stage_of({})

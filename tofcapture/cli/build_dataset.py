@@ -1,0 +1,124 @@
+"""``tofcapture build-dataset``: recordings to shards, manifest and card."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tofcapture.command import Command, Outcome
+from tofcapture.errors import ConfigError
+
+if TYPE_CHECKING:
+    from tofcapture.dataset.build import BuildResult
+
+_EVERY = 5.0  # s between lines of progress
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "recordings", nargs="+", type=Path, metavar="RECORDING", help="folders that record filled"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="the dataset's folder")
+    rig = parser.add_mutually_exclusive_group()
+    rig.add_argument(
+        "--rig", type=Path, metavar="TOML", help="rig to use (default: RECORDING/rig.toml, written by align)"
+    )
+    rig.add_argument(
+        "--true-rig", action="store_true", help="use the rig that the simulator knows (simulated recordings)"
+    )
+    parser.add_argument(
+        "--crop-radius", type=float, metavar="M", help="object within this radius, metres (default: 0.35)"
+    )
+    parser.add_argument("--far", type=float, metavar="M", help="deepest ground truth, metres (default: 2.0)")
+    parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core, at most 8)")
+
+
+class _Lines:
+    """Plain lines of progress with an ETA, now and then; on a terminal the line is rewritten after each view."""
+
+    def __init__(self, total: int) -> None:
+        self._total, self._done = total, 0
+        self._start = self._last = time.monotonic()
+
+    def __call__(self, scene: str, done: int, views: int) -> None:
+        self._done += 1
+        now = time.monotonic()
+        if not (sys.stderr.isatty() or now - self._last > _EVERY):
+            return
+        self._last = now
+        eta = (now - self._start) / self._done * max(0, self._total - self._done)
+        end = "\r" if sys.stderr.isatty() and done < views else "\n"
+        line = f"{scene}: view {done} of {views}, {self._done} of {self._total} in all, ETA {eta:.0f} s"
+        print(f"{line:<78}", end=end, file=sys.stderr, flush=True)
+
+
+def _positive(value: float | None, name: str) -> dict[str, Any]:
+    if value is None:
+        return {}
+    if not value > 0:
+        raise ConfigError(f"--{name.replace('_', '-')}: expected a positive number, got {value}")
+    return {name: value}
+
+
+def _run(args: argparse.Namespace) -> Outcome:
+    from tofcapture.dataset.build import build_dataset
+    from tofcapture.dataset.recordings import find_scenes
+    from tofcapture.dataset.sample import SampleConfig
+
+    config = SampleConfig(**_positive(args.crop_radius, "crop_radius"), **_positive(args.far, "far"))
+    _positive(args.jobs, "jobs")
+    start = time.monotonic()
+    total = sum(len(views) for _, views in find_scenes(args.recordings).values())
+    result = build_dataset(
+        args.recordings,
+        args.out,
+        args.rig,
+        true_rig=args.true_rig,
+        config=config,
+        jobs=args.jobs,
+        progress=_Lines(total),
+    )
+    return _outcome(result, time.monotonic() - start)
+
+
+def _outcome(result: BuildResult, seconds: float) -> Outcome:
+    views = sum(e.views for e in result.scenes.values())
+    data = {
+        "dataset": str(result.dataset),
+        "scenes": len(result.scenes),
+        "views": views,
+        "skipped": list(result.skipped),
+        "splits": {name: entry.split for name, entry in sorted(result.scenes.items())},
+        "gt": None if result.gt is None else result.gt.table(),
+        "failures": {scene: {"message": e.message, "hint": e.hint} for scene, e in result.failures.items()},
+        "seconds": round(seconds, 2),
+    }
+    return Outcome(data, _text(result, views, seconds), exit_code=5 if result.failures else 0)
+
+
+def _text(result: BuildResult, views: int, seconds: float) -> str:
+    lines = [
+        f"{name:<24} {entry.split:<6} {entry.views:>3} views" for name, entry in sorted(result.scenes.items())
+    ]
+    lines.append(f"{result.dataset}: {len(result.scenes)} scenes, {views} views in {seconds:.1f} s")
+    if result.skipped:
+        lines.append(f"{len(result.skipped)} scenes were already built")
+    if result.gt is not None:
+        gt = result.gt
+        lines.append(
+            f"ground truth against the simulator: median {gt.median_error_mm:.2f} mm, "
+            f"99 % {gt.p99_error_mm:.2f} mm, covers {gt.coverage:.0%} of the object"
+        )
+    lines += [f"FAILED {scene}: {error.message}" for scene, error in result.failures.items()]
+    return "\n".join(lines)
+
+
+COMMAND = Command(
+    help="build the shards of a dataset from recordings",
+    example="tofcapture build-dataset recordings/first --out datasets/first",
+    configure=_configure,
+    run=_run,
+)

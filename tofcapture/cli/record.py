@@ -1,0 +1,182 @@
+"""``tofcapture record``: take the views of a scene, or of the calibration board."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tofcapture.command import Command, Outcome
+from tofcapture.errors import MotionRefused
+
+if TYPE_CHECKING:
+    from tofcapture.devices.station import Station
+    from tofcapture.record.plan import Plan
+    from tofcapture.record.recorder import RecordResult
+
+_SCENE_VIEWS, _BOARD_VIEWS = 25, 12
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        "--scene", metavar="NAME", help="what stands on the table; names its folder in the recording"
+    )
+    what.add_argument("--calibration", action="store_true", help="views of the calibration board, for align")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="RECORDING",
+        help="folder to record into; resumed when it exists",
+    )
+    parser.add_argument(
+        "--views",
+        type=int,
+        help=f"number of views (default {_SCENE_VIEWS}, {_BOARD_VIEWS} for --calibration)",
+    )
+    parser.add_argument("--frames", type=int, default=10, help="ToF frames of each burst (default 10)")
+    parser.add_argument(
+        "--station", type=Path, metavar="TOML", help="devices to use (default: all simulated)"
+    )
+    parser.add_argument("--seed", type=int, help="seed of the simulated world and of the view plan")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="print the plan; nothing moves, nothing is written"
+    )
+    parser.add_argument(
+        "--allow-motion", action="store_true", help="let a real arm move (rehearse the plan first)"
+    )
+
+
+def _run(args: argparse.Namespace) -> Outcome:
+    from tofcapture.devices.sim.scenes import CALIBRATION
+    from tofcapture.devices.station import open_station
+    from tofcapture.record.recorder import record
+    from tofcapture.record.scene_plan import plan_scene
+
+    scene = CALIBRATION if args.calibration else args.scene
+    views = args.views if args.views is not None else _BOARD_VIEWS if args.calibration else _SCENE_VIEWS
+    with open_station(args.station, args.seed) as station:
+        if args.dry_run:
+            return _planned(scene, plan_scene(station, scene, views))
+        _check_motion(station, allowed=args.allow_motion)
+        with progress_line(f"record {scene}") as progress:
+            result = record(station, scene, args.out, views=views, frames=args.frames, progress=progress)
+    return _recorded(args.out, result)
+
+
+def _check_motion(station: Station, *, allowed: bool) -> None:
+    """Ask for consent before a real arm moves."""
+    if not (station.simulated or allowed):
+        raise MotionRefused(
+            f"the arm {station.arm.describe().model} is real and --allow-motion was not given",
+            hint="look at --dry-run, clear the workspace, then add --allow-motion",
+        )
+
+
+def _planned(scene: str, plan: Plan) -> Outcome:
+    rows = [
+        f"{v.index:4d}  {v.distance:8.3f} m  {' '.join(f'{x:+6.3f}' for x in v.direction)}   {' '.join(f'{x:+7.3f}' for x in v.joints)}"
+        for v in plan.views
+    ]
+    head = "view    distance  direction from target    joints (rad)"
+    return Outcome(
+        data={"ok": True, "scene": scene, "plan": plan.table()}, text="\n".join([plan.summary(), head, *rows])
+    )
+
+
+def _recorded(recording: Path, result: RecordResult) -> Outcome:
+    taken, kept = len(result.recorded), len(result.kept)
+    lines = [*result.repaired, *result.reasons]
+    if not taken and not result.failed:
+        lines.append(f"nothing to record: {kept} views of {result.scene!r} are there")
+    else:
+        lines.append(
+            f"{taken} views of {result.scene!r} recorded, {kept} were there, {len(result.failed)} failed: {recording}"
+        )
+    if len(result.plan.views) < result.plan.wanted:
+        lines.append(f"the arm reaches no more: {result.plan.summary()}")
+    data: dict[str, Any] = {
+        "ok": not result.failed,
+        "recording": str(recording),
+        "scene": result.scene,
+        "recorded": list(result.recorded),
+        "kept": list(result.kept),
+        "failed": list(result.failed),
+        "reasons": list(result.reasons),
+        "repaired": list(result.repaired),
+        "plan": {"digest": result.plan.digest, "views": len(result.plan.views), "wanted": result.plan.wanted},
+    }
+    return Outcome(data=data, text="\n".join(lines), exit_code=4 if result.failed else 0)
+
+
+@contextmanager
+def progress_line(title: str) -> Iterator[Callable[[int, int], None]]:
+    """Show progress on stderr: a bar with ETA on a terminal, otherwise a line for every tenth of the way.
+
+    Yields
+    ------
+    function of (done, total)
+    """
+    if sys.stderr.isatty():
+        yield from _bar(title)
+    else:
+        yield _lines(title)
+
+
+def _bar(title: str) -> Iterator[Callable[[int, int], None]]:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("ETA"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(title, total=None)
+
+        def show(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        yield show
+
+
+def _lines(title: str) -> Callable[[int, int], None]:
+    start = time.monotonic()
+    first: list[int] = []
+    said = [-1]
+
+    def show(done: int, total: int) -> None:
+        first[:] = first or [done]
+        tenth = 10 * done // max(total, 1)
+        if tenth == said[0]:
+            return
+        said[0] = tenth
+        gone = time.monotonic() - start
+        eta = f", ETA {gone / (done - first[0]) * (total - done):.0f} s" if first[0] < done < total else ""
+        print(f"{title}: {done}/{total}{eta}", file=sys.stderr, flush=True)
+
+    return show
+
+
+COMMAND = Command(
+    help="capture the views of a scene or of the calibration board; resumable",
+    example="tofcapture record --scene mug --out recordings/mug",
+    configure=_configure,
+    run=_run,
+)

@@ -1,0 +1,66 @@
+"""``tofcapture report``: one HTML file that shows what was captured, how it was aligned, and what the network makes of it.
+
+No script, no address of another file: pictures are inside, lengths are millimetres. Same inputs, same bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from tofcapture.command import Outcome
+from tofcapture.files.seal import write_text
+
+VIEWS = 3  # example views: what fits into a few megabytes
+
+
+def write_report(
+    dataset: Path | None,
+    results: Path | None,
+    evidence: Path | None,
+    weights: Path | None,
+    out: Path,
+    *,
+    views: int = VIEWS,
+) -> Path:
+    """Write the page.
+
+    Parameters
+    ----------
+    dataset
+        Folder that ``build-dataset`` wrote: example views, rig, digests. None: their sections say that they are absent.
+    results
+        ``results.json`` of ``evaluate``: the headline and the tables.
+    evidence
+        ``evidence.json`` of ``align``; None or a missing file: the section says so.
+    weights
+        Checkpoint or folder of a run; None: the bundled weights. Where there are none, pictures show the sensor alone.
+    out
+        The HTML file, written atomically.
+    views
+        Number of example views, taken evenly from the split that ``results`` names, otherwise from ``test``.
+
+    Returns
+    -------
+    ``out``
+
+    Raises
+    ------
+    ConfigError
+        Neither a dataset nor results are given, or jinja2 or matplotlib is missing.
+    DataError, FormatError
+        A part that is given is damaged or foreign.
+    """
+    from tofcapture_model.report.page import read_sources, render_page
+
+    page = render_page(read_sources(dataset, results, evidence, weights), views)
+    write_text(Path(out), page)
+    return Path(out)
+
+
+def run(args: argparse.Namespace) -> Outcome:
+    """Run the command ``report``: ``args`` are its ``dataset``, ``results``, ``evidence``, ``weights`` and ``out``."""
+    out = write_report(args.dataset, args.results, args.evidence, args.weights, args.out)
+    size = out.stat().st_size
+    data = {"report": str(out), "bytes": size}
+    return Outcome(data, f"{out}: {size / 1e6:.1f} MB, opens in any browser")
