@@ -40,7 +40,7 @@ CONFIG = SampleConfig()
 
 def simulate(scene, index, distance=0.5, constants=SMALL):
     world = SimWorld(read_constants(constants, "test"), 0, scene_objects)
-    target = np.asarray(TABLE_CENTRE) + [0, 0, 0.03]
+    target = np.asarray(TABLE_CENTRE) + np.array([0, 0, 0.03])
     direction = np.array([0.3 * (index - 1), 0.3, 0.9])
     T_base_tof = look_at(target + distance * direction / np.linalg.norm(direction), target)
     T_base_flange = T_base_tof @ invert(world.true_rig.T_flange_tof)

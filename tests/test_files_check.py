@@ -33,8 +33,8 @@ SMALL = {
 
 def simulate(scene, index):
     world = SimWorld(read_constants(SMALL, "test"), 0, scene_objects)
-    target = np.asarray(TABLE_CENTRE) + [0, 0, 0.03]
-    T_base_tof = look_at(target + [0.1 * index, 0.15, 0.45], target)
+    target = np.asarray(TABLE_CENTRE) + np.array([0, 0, 0.03])
+    T_base_tof = look_at(target + np.array([0.1 * index, 0.15, 0.45]), target)
     T_base_flange = T_base_tof @ invert(world.true_rig.T_flange_tof)
     world.place(scene)
     world.set_pose(T_base_flange, bytes([index]))
@@ -285,7 +285,7 @@ def test_the_command(here):
         0,
         {"path": str(here / "recording"), "ok": True, "files": 2, "problems": []},
     )
-    os.chmod(here / "dataset/shards/box.h5", 0o644)
+    (here / "dataset/shards/box.h5").chmod(0o644)
     os.truncate(here / "dataset/shards/box.h5", 5000)
     code, result = run(here / "dataset")
     assert (code, result["ok"]) == (5, False)

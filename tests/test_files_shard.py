@@ -6,6 +6,8 @@ import json
 import multiprocessing
 import os
 import pickle
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -132,7 +134,7 @@ def test_the_reader_pickles_and_survives_a_fork(tmp_path):
     write(path)
     reader = ShardReader(path)
     expected = _raw_sum(reader)
-    assert _raw_sum(pickle.loads(pickle.dumps(reader))) == expected
+    assert _raw_sum(pickle.loads(pickle.dumps(reader))) == expected  # noqa: S301
     if hasattr(os, "fork"):
         context = multiprocessing.get_context("fork")
         queue = context.SimpleQueue()
@@ -155,15 +157,14 @@ def test_samples_that_do_not_fit_are_refused_and_leave_nothing(tmp_path):
         replace(make_sample(1), truth=None),
         replace(make_sample(1), native_depth=np.zeros((12, 16))),
     ):
-        with pytest.raises(FormatError), ShardWriter(path, "mug", RIG, INFO, info, 2) as shard:
+        with ShardWriter(path, "mug", RIG, INFO, info, 2) as shard:
             shard.add(make_sample(0))
-            shard.add(bad)
-    with (
-        pytest.raises(FormatError, match="expected 2 samples, got 1"),
-        ShardWriter(path, "mug", RIG, INFO, info, 2) as s,
-    ):
-        s.add(make_sample(0))
-        s.seal({})
+            with pytest.raises(FormatError):
+                shard.add(bad)
+    with ShardWriter(path, "mug", RIG, INFO, info, 2) as shard:
+        shard.add(make_sample(0))
+        with pytest.raises(FormatError, match="expected 2 samples, got 1"):
+            shard.seal({})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -210,6 +211,18 @@ def test_manifest_round_trip_and_validation(tmp_path):
     path.unlink()
     with pytest.raises(DataError, match="cannot read"):
         load_manifest(tmp_path)
+
+
+def test_reading_needs_numpy_and_h5py_only():
+    """Importing readers, checks and light ops loads nothing that a reader of the data does not have."""
+    code = """
+import sys
+import tofcapture.files.shard, tofcapture.files.view, tofcapture.files.manifest, tofcapture.files.check
+import tofcapture.ops.phase, tofcapture.ops.normals
+print(sorted({"scipy", "torch", "open3d", "tomli_w", "matplotlib", "rich", "cv2", "jinja2"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def test_objects_of_scenes():

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -122,7 +123,7 @@ def test_sigkill_at_any_step(tmp_path, step):
     path = tmp_path / "view-007.h5"
     code = f"""
 import os, pathlib, signal, sys
-sys.path.insert(0, {str(os.path.dirname(__file__))!r})
+sys.path.insert(0, {str(Path(__file__).parent)!r})
 import test_files_view as t
 from tofcapture.files import seal, view
 die = lambda *a, **k: os.kill(os.getpid(), signal.SIGKILL)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -101,31 +102,55 @@ def write_dataset(folder, scene="ball", views=2, model="synthetic"):
         for view in range(views):
             shard.add(sample(view))
         digest = shard.seal({"gt": gt})
-    write_manifest(folder, Manifest({scene: SceneEntry("shards/one.h5", digest, views, "test")}, {}, {"numpy": "2"}))
+    write_manifest(
+        folder, Manifest({scene: SceneEntry("shards/one.h5", digest, views, "test")}, {}, {"numpy": "2"})
+    )
     return folder
 
 
 def results_table(scene="ball", provenance=None):
     """A results.json with easily found numbers."""
+
     def method(mae, angle):
-        depth = {"mae": mae, "median": mae / 2, "rmse": 2 * mae, "bias": -mae / 4, "within_10mm": 0.5, "pixels": 7}
+        depth = {
+            "mae": mae,
+            "median": mae / 2,
+            "rmse": 2 * mae,
+            "bias": -mae / 4,
+            "within_10mm": 0.5,
+            "pixels": 7,
+        }
         normal = {"mean_deg": angle, "within_20deg": 0.75, "pixels": 7}
         return {"depth": {"pixel": depth, "image": depth}, "normal": {"pixel": normal, "image": normal}}
 
     return {
-        "format": "tofcapture-results", "version": 1, "dataset": "d", "split": "test", "scenes": [scene], "views": 2,
-        "frames": 2, "units": "m", "training": provenance,
+        "format": "tofcapture-results",
+        "version": 1,
+        "dataset": "d",
+        "split": "test",
+        "scenes": [scene],
+        "views": 2,
+        "frames": 2,
+        "units": "m",
+        "training": provenance,
         "methods": {"sensor": method(0.0123456, 20.5), "model": method(0.0034567, 7.25)},
     }
 
 
 def evidence_table(**changes):
     """An evidence.json of three good pairs and a refused one."""
+
     def pair(i, reason=""):
         far = None if reason else 0.02
         return {
-            "view": f"views/calibration/view-{i:03}.h5", "accepted": not reason, "reason": reason, "rmse_mm": 1.5 + i,
-            "inliers": 4000, "fitness": 0.8, "condition": 120.0, "rotation_from_mean_deg": far,
+            "view": f"views/calibration/view-{i:03}.h5",
+            "accepted": not reason,
+            "reason": reason,
+            "rmse_mm": 1.5 + i,
+            "inliers": 4000,
+            "fitness": 0.8,
+            "condition": 120.0,
+            "rotation_from_mean_deg": far,
             "translation_from_mean_mm": far,
         }
 
@@ -133,11 +158,27 @@ def evidence_table(**changes):
     T[0, 3] = 0.0615
     small = {"rotation_deg": 0.02, "translation_mm": 0.2}
     return {
-        "format": "tofcapture-evidence", "version": 1, "backend": "open3d", "views": 4, "used": 3,
-        "T_tof_stereo": T.tolist(), "initial_T_tof_stereo": np.eye(4).tolist(), "spread": small,
-        "standard_error": small, "pairs": [*(pair(i) for i in range(3)), pair(3, "planar-degenerate")],
+        "format": "tofcapture-evidence",
+        "version": 1,
+        "backend": "open3d",
+        "views": 4,
+        "used": 3,
+        "T_tof_stereo": T.tolist(),
+        "initial_T_tof_stereo": np.eye(4).tolist(),
+        "spread": small,
+        "standard_error": small,
+        "pairs": [*(pair(i) for i in range(3)), pair(3, "planar-degenerate")],
         "truth": {"rotation_error_deg": 0.031, "translation_error_mm": 0.77},
     } | changes
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread():
+    """Maps this small are slower on many threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -145,31 +186,37 @@ def parts(tmp_path_factory):
     """Dataset, results, evidence and weights on disk."""
     folder = tmp_path_factory.mktemp("report")
     torch.manual_seed(0)
-    config = preset("demo")
+    config = replace(preset("demo"), network=replace(preset("demo").network, width=4, windows=(2,)))
     provenance = {"steps": 3}
     save_model(folder / "model/model.safetensors", build_model(config), config, provenance)
     rows = [{"step": s, "stage": "joint", "total": 5.0 / s} for s in (1, 21, 41)]
     rows.append({"step": 41, "stage": "joint", "val_mae": 0.00876, "val_angle_deg": 9.5})
-    (folder / "model/metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows) + '{"step": 61, "tot')
+    (folder / "model/metrics.jsonl").write_text(
+        "".join(json.dumps(r) + "\n" for r in rows) + '{"step": 61, "tot'
+    )
     (folder / "results.json").write_text(json.dumps(results_table(provenance=provenance)))
     (folder / "evidence.json").write_text(json.dumps(evidence_table()))
     write_dataset(folder / "dataset")
     return {
-        "dataset": folder / "dataset", "results": folder / "results.json",
-        "evidence": folder / "evidence.json", "weights": folder / "model",
+        "dataset": folder / "dataset",
+        "results": folder / "results.json",
+        "evidence": folder / "evidence.json",
+        "weights": folder / "model",
     }
 
 
 @pytest.fixture(scope="module")
 def page(parts, tmp_path_factory):
     """The whole page."""
-    return write_report(**parts, out=tmp_path_factory.mktemp("out") / "report.html").read_text(encoding="utf-8")
+    return write_report(**parts, out=tmp_path_factory.mktemp("out") / "report.html").read_text(
+        encoding="utf-8"
+    )
 
 
 class Tags(HTMLParser):
     """Collects tags, and checks that they are nested well."""
 
-    VOID = {"meta", "img", "br", "line", "rect", "path", "polyline"}
+    VOID = frozenset({"meta", "img", "br", "line", "rect", "path", "polyline"})
 
     def __init__(self, text):
         super().__init__(convert_charrefs=True)
@@ -212,7 +259,18 @@ def test_page_holds_every_section_and_its_anchors_lead_somewhere(page):
 
 def test_numbers_are_millimetres(page):
     """What results, evidence, ground truth and validation say in metres stands there in millimetres."""
-    for text in ("12.35", "3.46", "20.50", "7.25", "72 % less", "0.42 mm", "8.76", "0.770 mm", "0.0615", "61.50"):
+    for text in (
+        "12.35",
+        "3.46",
+        "20.50",
+        "7.25",
+        "72 % less",
+        "0.42 mm",
+        "8.76",
+        "0.770 mm",
+        "0.0615",
+        "61.50",
+    ):
         assert text in page
     assert "0.0034567" not in page
     assert "simulated station" in page
@@ -230,11 +288,9 @@ def test_page_is_small(page):
     assert len(page) < 1_500_000
 
 
-def test_same_inputs_same_bytes(parts, tmp_path):
+def test_same_inputs_same_bytes(parts, page, tmp_path):
     """Nothing but the inputs gets into the page: no clock, no temporary name."""
-    first = write_report(**parts, out=tmp_path / "a.html", views=1)
-    second = write_report(**parts, out=tmp_path / "b" / "b.html", views=1)
-    assert first.read_bytes() == second.read_bytes()
+    assert write_report(**parts, out=tmp_path / "b" / "b.html").read_text(encoding="utf-8") == page
 
 
 def test_names_are_escaped(tmp_path):
@@ -249,7 +305,9 @@ def test_names_are_escaped(tmp_path):
     evidence = evidence_table()
     evidence["pairs"][3]["reason"] = "<u>because</u>"
     (tmp_path / "e.json").write_text(json.dumps(evidence))
-    out = write_report(dataset, tmp_path / "r.json", tmp_path / "e.json", tmp_path / "none", tmp_path / "o.html")
+    out = write_report(
+        dataset, tmp_path / "r.json", tmp_path / "e.json", tmp_path / "none", tmp_path / "o.html"
+    )
     page = out.read_text()
     assert not re.search("<b>mug|<i>camera|<u>because", page)
     for text in ("&lt;b&gt;mug&lt;/b&gt;&amp;", "&lt;i&gt;camera", "&lt;u&gt;because"):
@@ -292,7 +350,9 @@ def test_damage_is_an_error(parts, tmp_path):
 def test_doubts_are_told(parts, tmp_path):
     """Results of other weights, and of other scenes than the dataset holds, put a warning on the page."""
     (tmp_path / "r.json").write_text(json.dumps(results_table("another", {"steps": 99})))
-    page = write_report(**{**parts, "results": tmp_path / "r.json"}, out=tmp_path / "o.html", views=1).read_text()
+    page = write_report(
+        **{**parts, "results": tmp_path / "r.json"}, out=tmp_path / "o.html", views=1
+    ).read_text()
     assert "other weights than the table" in page
     assert "other scenes than" in page
 
@@ -300,7 +360,9 @@ def test_doubts_are_told(parts, tmp_path):
 def test_command_writes_the_page(parts, tmp_path, capsys):
     """The command line reaches it, and --json tells where the page is."""
     out = tmp_path / "o.html"
-    words = [w for name in ("dataset", "results", "evidence", "weights") for w in (f"--{name}", str(parts[name]))]
+    words = [
+        w for name in ("dataset", "results", "evidence", "weights") for w in (f"--{name}", str(parts[name]))
+    ]
     assert main(["report", *words, "--out", str(out), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert (answer["report"], answer["bytes"]) == (str(out), out.stat().st_size)
@@ -394,7 +456,9 @@ def test_limits_are_round():
 
 def test_mask_colour_is_that_of_the_first_bit():
     """Good pixels are 0; of several bits the first one decides."""
-    assert mask_indices(np.array([[0, 1, 2, 4, 8, 16, 24, 17]], np.uint8)).tolist() == [[0, 1, 2, 3, 4, 5, 4, 1]]
+    assert mask_indices(np.array([[0, 1, 2, 4, 8, 16, 24, 17]], np.uint8)).tolist() == [
+        [0, 1, 2, 3, 4, 5, 4, 1]
+    ]
 
 
 def test_views_are_taken_evenly():

@@ -92,7 +92,7 @@ def test_the_dominant_plane_is_found(azimuth, tilt, seed):
     flat = generator.uniform(-0.4, 0.4, (6000, 3))
     flat -= np.outer(flat @ normal + 0.8, normal)
     flat += 0.0005 * generator.standard_normal(flat.shape)
-    clutter = generator.uniform(-0.5, 0.5, (4000, 3)) + [0, 0, 0.9]
+    clutter = generator.uniform(-0.5, 0.5, (4000, 3)) + np.array([0, 0, 0.9])
     found = dominant_plane(np.concatenate([flat, clutter]), generator)
     assert found is not None
     assert np.degrees(np.arccos(min(1, found[0] @ normal))) < 0.2
@@ -112,6 +112,18 @@ def test_crop_keeps_what_stands_on_the_table():
     expected[50:80, 60:100] = True
     np.testing.assert_array_equal(kept, expected)
     assert crop.normal @ [0, 0, -1] == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("top", [0.0, 0.05, 0.3])
+def test_a_flat_top_that_fills_the_view_is_not_the_table(top):
+    """A box whose top covers most of the view stands on the table below it; the floor further down is not the table."""
+    depth = np.full(CAMERA.shape, 1.0)
+    depth[:, 15:145] = 1.0 - top
+    depth[:12] = 1.7
+    points = CAMERA.unproject(depth * (1 + 2e-4 * rng().standard_normal(CAMERA.shape)))
+    crop = find_crop(points, rng(), radius=0.6)
+    assert crop.offset == pytest.approx(-1.0, abs=1e-3)
+    assert inside(crop, points)[20:, 20:140].mean() == pytest.approx(1.0 if top else 0.0, abs=1e-3)
 
 
 def test_without_a_table_everything_within_range_stays():

@@ -33,7 +33,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         "--crop-radius", type=float, metavar="M", help="object within this radius, metres (default: 0.35)"
     )
     parser.add_argument("--far", type=float, metavar="M", help="deepest ground truth, metres (default: 2.0)")
-    parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core, at most 8)")
+    parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core, at most 4)")
 
 
 class _Lines:

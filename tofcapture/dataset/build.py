@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from tofcapture.dataset.card import write_card
 from tofcapture.dataset.recordings import find_scenes, rig_for
 from tofcapture.dataset.sample import SampleConfig, calibrated, make_sample
 from tofcapture.dataset.split import assign_splits
-from tofcapture.dataset.truth import TruthError, ViewError, pool, view_error
+from tofcapture.dataset.truth import TruthError, ViewError, pool, pooled_error, view_error
 from tofcapture.errors import TofError
 from tofcapture.files.hdf import dumps
 from tofcapture.files.layout import SHARD
@@ -190,32 +189,6 @@ def finished(job: SceneJob, path: Path) -> str | None:
         return None
 
 
-def _pooled_error(dataset: Path, scenes: Mapping[str, SceneEntry]) -> TruthError | None:
-    """Pool over shards; reads them back, so that skipped ones count as well."""
-    errors: list[ViewError] = []
-    for entry in scenes.values():
-        with ShardReader(dataset / entry.path) as shard:
-            gt = shard.provenance.get("gt")
-            if gt is None:
-                continue
-            errors += [
-                ViewError(
-                    _shard_errors(shard), round(gt["coverage"] * gt["target_pixels"]), gt["target_pixels"]
-                )
-            ]
-    return pool(errors) if errors else None
-
-
-def _shard_errors(shard: ShardReader) -> np.ndarray[Any, np.dtype[np.float32]]:
-    out = []
-    for view in range(shard.views):
-        gt, truth = shard.ground_truth(view, 2), shard.truth(view)
-        if truth is not None:
-            errors = np.abs(gt.depth - truth.depth)[gt.mask == 0]
-            out.append(np.where(np.isfinite(errors), errors, np.float32(np.inf)))
-    return np.concatenate(out) if out else np.zeros(0, np.float32)
-
-
 def _job(scene: str, found: tuple[Path, tuple[Path, ...]], rig: Rig, config: SampleConfig) -> SceneJob:
     _, views = found
     return SceneJob(scene, views, rig, config, tuple(sealed_digest(p) for p in views))
@@ -246,7 +219,7 @@ def build_dataset(
     config
         Constants of the ground truth.
     jobs
-        Processes; by default one per core, at most eight.
+        Processes; by default one per core, at most four; each takes 0.6 GB.
     progress
         Told after each view.
 
@@ -272,7 +245,7 @@ def build_dataset(
     skipped: list[str] = []
     splits = assign_splits(found)
     out = Path(out)
-    with _workers(jobs if jobs is not None else min(8, os.cpu_count() or 1)) as workers:
+    with _workers(jobs if jobs is not None else min(4, os.cpu_count() or 1)) as workers:
         for scene in found:
             path = out / "shards" / f"{scene}.h5"
             try:
@@ -287,7 +260,7 @@ def build_dataset(
                 continue
             entries[scene] = SceneEntry(f"shards/{scene}.h5", digest, len(job.views), splits[scene])
     _remove_partials(out)
-    gt = _pooled_error(out, entries)
+    gt = pooled_error(out / e.path for e in entries.values())
     _finish(out, entries, config, gt)
     return BuildResult(out, entries, tuple(skipped), failures, gt)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofcapture.dataset.sample import SampleConfig, make_sample
 from tofcapture.errors import DataError
-from tofcapture.files.shard import Sample
+from tofcapture.files.shard import GroundTruth, Sample, ShardReader
 from tofcapture.frames import View
 from tofcapture.rig import Rig
 
@@ -27,21 +29,22 @@ class TruthError:
         Of ``|depth - truth|``, millimetres, printed as such; NaN without pixels.
     pixels
         Pixels whose mask is 0.
-    target_pixels
-        Pixels whose ray truly hits the object.
+    target_pixels, covered_pixels
+        Pixels whose ray truly hits the object, and those of them whose mask is 0.
     coverage
-        Share of the object's pixels whose mask is 0.
+        The share of the latter.
     """
 
     median_error_mm: float
     p99_error_mm: float
     pixels: int
     target_pixels: int
+    covered_pixels: int
     coverage: float
 
     def table(self) -> dict[str, Any]:
         """As JSON types: numbers that are not finite become null."""
-        return {k: None if v != v else v for k, v in asdict(self).items()}  # noqa: PLR0124  NaN
+        return {k: v if np.isfinite(v) else None for k, v in asdict(self).items()}
 
 
 @dataclass(frozen=True)
@@ -66,11 +69,8 @@ def view_error(sample: Sample, view: View) -> ViewError | None:
     if view.truth is None:
         return None
     gt = sample.ground_truth[2]
-    good = gt.mask == 0
-    errors = np.abs(gt.depth - view.truth.depth)[good]
-    # Ground truth where the truth has no surface at all is as wrong as can be: it must not vanish from the percentiles.
-    errors = np.where(np.isfinite(errors), errors, np.float32(np.inf))
-    return ViewError(errors, int((good & view.truth.target).sum()), int(view.truth.target.sum()))
+    covered = int(((gt.mask == 0) & view.truth.target).sum())
+    return ViewError(_absolute(gt, view.truth.depth), covered, int(view.truth.target.sum()))
 
 
 def pool(views: list[ViewError]) -> TruthError:
@@ -78,8 +78,10 @@ def pool(views: list[ViewError]) -> TruthError:
     errors = np.concatenate([v.errors for v in views] or [np.zeros(0, np.float32)])
     target = sum(v.target_pixels for v in views)
     median, p99 = np.percentile(errors, [50, 99], method="nearest") * 1e3 if len(errors) else (np.nan, np.nan)
-    covered = sum(v.covered for v in views) / target if target else np.nan
-    return TruthError(float(median), float(p99), len(errors), target, float(covered))
+    covered = sum(v.covered for v in views)
+    return TruthError(
+        float(median), float(p99), len(errors), target, covered, covered / target if target else float("nan")
+    )
 
 
 def ground_truth_error(view: View, rig: Rig, config: SampleConfig | None = None) -> TruthError:
@@ -97,3 +99,32 @@ def ground_truth_error(view: View, rig: Rig, config: SampleConfig | None = None)
             f"{view.scene} view {view.index}: carries no truth", hint="only simulated recordings do"
         )
     return pool([error])
+
+
+def pooled_error(shards: Iterable[Path]) -> TruthError | None:
+    """Pool over finished shards; ``None`` when none of them carries truth."""
+    errors: list[ViewError] = []
+    for path in shards:
+        with ShardReader(path) as shard:
+            gt = shard.provenance.get("gt")
+            if gt is not None:
+                errors.append(ViewError(_shard_errors(shard), gt["covered_pixels"], gt["target_pixels"]))
+    return pool(errors) if errors else None
+
+
+def _shard_errors(shard: ShardReader) -> Float32:
+    out = [np.zeros(0, np.float32)]
+    for view in range(shard.views):
+        gt, truth = shard.ground_truth(view, 2), shard.truth(view)
+        if truth is not None:
+            out.append(_absolute(gt, truth.depth))
+    return np.concatenate(out)
+
+
+def _absolute(gt: GroundTruth, truth: Float32) -> Float32:
+    """Absolute depth errors where the mask is 0.
+
+    Ground truth where the truth has no surface at all is as wrong as can be: it must not vanish from the percentiles.
+    """
+    errors = np.abs(gt.depth - truth)[gt.mask == 0]
+    return np.where(np.isfinite(errors), errors, np.float32(np.inf))

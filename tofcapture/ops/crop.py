@@ -1,7 +1,7 @@
 """Find the table and say what stands on it.
 
-The table is the dominant plane among the points around the optical axis; the scene's object is what stands above it, not
-far from where the camera looks.
+The table is the dominant plane, or a parallel one below it: from close by, the flat top of an object may fill more of the view
+than the table does. The scene's object is what stands above the table, not far from where the camera looks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ Bool = NDArray[np.bool_]
 TRIALS = 200
 SAMPLE = 20_000  # points that vote
 INLIER = 0.004  # m
-DOMINANT = 0.2  # share of the voting points below which there is no table
+DOMINANT = 0.2  # share of the points below which there is no dominant plane
+TALLEST = 0.4  # m; a parallel plane further below a flat top is the floor, not the table
+PARALLEL = 0.05  # share of the points that makes a parallel plane below
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def _candidates(points: Float64, rng: np.random.Generator) -> tuple[Float64, Flo
 def dominant_plane(points: Float64, rng: np.random.Generator) -> tuple[Float64, float, float] | None:
     """Find the plane that most points (N, 3) lie on.
 
-    RANSAC over {TRIALS} triples, then two rounds of least squares over the inliers.
+    RANSAC over 200 triples, then three rounds of least squares over the inliers.
 
     Parameters
     ----------
@@ -91,12 +93,38 @@ def dominant_plane(points: Float64, rng: np.random.Generator) -> tuple[Float64, 
     votes = (np.abs(points[:: max(1, len(points) // 4000)] @ normals.T - offsets) < INLIER).sum(axis=0)
     best = int(votes.argmax())
     normal, offset = normals[best], float(offsets[best])
+    return _refined(points, normal, offset, DOMINANT)
+
+
+def _refined(
+    points: Float64, normal: Float64, offset: float, share: float
+) -> tuple[Float64, float, float] | None:
+    """Fit the plane to its inliers three times; ``None`` when they become fewer than a share of the points."""
     for _ in range(3):
         inliers = points[np.abs(points @ normal - offset) < INLIER]
-        if len(inliers) < max(10, DOMINANT * len(points)):
+        if len(inliers) < max(10, share * len(points)):
             return None
         normal, offset = _plane_of(inliers)
     return normal, offset, float(np.sqrt(np.mean((inliers @ normal - offset) ** 2)))
+
+
+def table_plane(points: Float64, rng: np.random.Generator) -> tuple[Float64, float, float] | None:
+    """Find the plane that things stand on: the dominant one, or the lowest parallel one within an object's height below it.
+
+    Parameters and result as for :func:`dominant_plane`.
+    """
+    found = dominant_plane(points, rng)
+    if found is None:
+        return None
+    normal, offset, _ = found
+    below = offset - points @ normal
+    below = below[(below > 2 * INLIER) & (below < TALLEST)]
+    counts, edges = np.histogram(below, bins=np.arange(0.0, TALLEST + 2 * INLIER, INLIER))
+    planes = np.flatnonzero(counts[:-1] + counts[1:] >= PARALLEL * len(points))
+    if len(planes) == 0:
+        return found
+    lower = _refined(points, normal, offset - float(edges[planes[-1] + 1]), PARALLEL / 2)
+    return lower or found
 
 
 def find_crop(
@@ -122,7 +150,7 @@ def find_crop(
     """
     cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     cloud = cloud[np.isfinite(cloud[:, 2]) & (cloud[:, 2] > 0) & (cloud[:, 2] < far)]
-    found = dominant_plane(cloud, rng)
+    found = table_plane(cloud, rng)
     if found is None:
         return Crop(np.full(3, np.nan), np.nan, np.zeros(3), np.inf, 0.0, far)
     normal, offset, rms = found

@@ -60,8 +60,7 @@ class Projection:
     pixels
         (H, W, 2) float64, (u, v) on the stereo grid of the point that is met; NaN where depth is.
     normals
-        (H, W, 3) float64, of the triangles, ToF frame, unit, facing the camera; NaN where depth is. As noisy as three
-        points make them.
+        (H, W, 3) float64, of the triangles (noisy), ToF frame, unit, facing the camera; NaN where depth is.
     occluded, edge
         (H, W) bool, reasons to mistrust the pixel.
     """
@@ -107,12 +106,7 @@ def _bridge(z: Float64, footprint: float) -> tuple[Float64, Bool]:
 def triangulate(depth: NDArray[np.floating], camera: Camera) -> Sheet:
     """Turn a stereo depth image into a sheet with cuts.
 
-    Parameters
-    ----------
-    depth
-        (SH, SW) z in the stereo frame, metres; NaN: none.
-    camera
-        Intrinsics of the stereo grid.
+    ``depth`` is (SH, SW) z in the stereo frame in metres, NaN: none; ``camera`` holds the intrinsics of that grid.
 
     Raises
     ------
@@ -281,10 +275,6 @@ def project(sheet: Sheet, points: Float64, camera: Camera, edge_pixels: int) -> 
         Intrinsics on the ToF plane, any size.
     edge_pixels
         Pixels this near to a depth edge or to a pixel without surface are marked.
-
-    Returns
-    -------
-    Projection
     """
     hits = _intersect(points, camera)
     normals = _triangle_normals(hits, points)

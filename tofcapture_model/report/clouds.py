@@ -88,7 +88,8 @@ def render(
 def _colours(normals: Float64, values: NDArray[np.floating]) -> UInt8:
     hue = np.where(np.isfinite(values), np.rint(np.clip(np.nan_to_num(values), 0, 1) * (HUES - 2)), HUES - 1)
     light = np.clip(np.nan_to_num(normals @ (_LIGHT / np.linalg.norm(_LIGHT))), 0, 1)
-    return (hue * SHADES + np.rint(light * (SHADES - 1))).astype(np.uint8)
+    indices: UInt8 = (hue * SHADES + np.rint(light * (SHADES - 1))).astype(np.uint8)
+    return indices
 
 
 def _splat(at: NDArray[np.int64], depth: Float64, colour: UInt8, dot: int) -> UInt8:

@@ -89,12 +89,14 @@ class Example:
     @property
     def good(self) -> NDArray[np.bool_]:
         """(2H, 2W) where metrics are taken."""
-        return self.ground_truth.mask == 0
+        out: NDArray[np.bool_] = self.ground_truth.mask == 0
+        return out
 
     @property
     def surface(self) -> NDArray[np.bool_]:
         """(2H, 2W) where the ground truth is sound, on the object or around it."""
-        return (self.ground_truth.mask & ~np.uint8(MaskBit.OUTSIDE)) == 0
+        out: NDArray[np.bool_] = (self.ground_truth.mask & ~np.uint8(MaskBit.OUTSIDE)) == 0
+        return out
 
     @property
     def window(self) -> tuple[slice, slice]:

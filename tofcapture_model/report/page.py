@@ -110,7 +110,7 @@ def render_page(sources: Sources, views: int) -> str:
     """Render the HTML of a page with so many example views; same sources, same text."""
     try:
         import jinja2
-        import matplotlib as _  # noqa: F401  its colour maps are needed further down
+        import matplotlib as mpl  # noqa: F401  its colour maps are needed further down
     except ImportError as err:
         raise ConfigError(f"the report needs {err.name}", hint="pip install 'tofcapture[report]'") from err
     environment = jinja2.Environment(

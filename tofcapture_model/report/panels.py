@@ -138,7 +138,9 @@ def mask_picture(mask: UInt8, window: tuple[slice, slice]) -> Picture:
     colours = np.full((256, 3), 255, np.uint8)
     colours[: 1 + len(MASK_COLOURS)] = [GOOD_COLOUR, *MASK_COLOURS.values()]
     indices = _framed(mask_indices(mask), window, colour=255)
-    return indexed_picture("ground-truth mask", indices, colours, "mask of the ground truth", "frame: what is shown below")
+    return indexed_picture(
+        "ground-truth mask", indices, colours, "mask of the ground truth", "frame: what is shown below"
+    )
 
 
 def mask_legend(mask: UInt8) -> list[tuple[str, str, str]]:
@@ -146,7 +148,9 @@ def mask_legend(mask: UInt8) -> list[tuple[str, str, str]]:
     shares = np.bincount(mask_indices(mask).ravel(), minlength=1 + len(MASK_COLOURS)) / max(mask.size, 1)
     words = ["0: good, metrics are taken here", *(f"{int(bit)}: {MASK_WORDS[bit]}" for bit in MASK_COLOURS)]
     colours = [f"rgb{c}" for c in (GOOD_COLOUR, *MASK_COLOURS.values())]
-    return [(c, w, f"{100 * s:.1f}\N{NO-BREAK SPACE}%") for c, w, s in zip(colours, words, shares, strict=True)]
+    return [
+        (c, w, f"{100 * s:.1f}\N{NO-BREAK SPACE}%") for c, w, s in zip(colours, words, shares, strict=True)
+    ]
 
 
 def _depths(example: Example) -> Group:
@@ -155,7 +159,11 @@ def _depths(example: Example) -> Group:
     known = known if known.size else example.sensor.depth.ravel()
     low, high = (1e3 * float(x) for x in np.percentile(known, [0.5, 99.5]))
     scale = Scale("viridis", np.floor(low / 10) * 10, np.ceil(high / 10) * 10, "mm")
-    pictures = [scalar_picture("ToF depth, one frame", 1e3 * example.tof_depth[half], scale, "depth of the ToF sensor")]
+    pictures = [
+        scalar_picture(
+            "ToF depth, one frame", 1e3 * example.tof_depth[half], scale, "depth of the ToF sensor"
+        )
+    ]
     if example.model:
         depth = 1e3 * example.model.depth[example.window]
         pictures.append(scalar_picture("depth, network, same frame", depth, scale, "depth of the network"))
@@ -187,7 +195,9 @@ def _errors(example: Example, scale: Scale) -> Group:
             scalar_picture("error that the network expects", values, expected, "expected error", note)
         )
         scales.append(("expected absolute error", expected))
-    return Group("Depth error", "Red: too far, blue: too near, grey: no sound ground truth.", pictures, scales)
+    return Group(
+        "Depth error", "Red: too far, blue: too near, grey: no sound ground truth.", pictures, scales
+    )
 
 
 def _mean(values: NDArray[np.floating]) -> float:
@@ -211,7 +221,11 @@ def _normals(example: Example) -> Group:
         angle = mean_angle_deg(example, answer)
         note = f"mean angle {angle:.1f} degrees on the object" if np.isfinite(angle) else "no good pixel"
         title = f"normals, {METHOD_TITLES[name]}"
-        pictures.append(normal_picture(title, answer.normals[example.window], f"normals of the {METHOD_TITLES[name]}", note))
+        pictures.append(
+            normal_picture(
+                title, answer.normals[example.window], f"normals of the {METHOD_TITLES[name]}", note
+            )
+        )
     truth = example.ground_truth.normals[example.window]
     pictures.append(normal_picture("normals, ground truth", truth, "normals of the ground truth"))
     return Group("Normals", "Redder to the right, greener upwards, bluer towards the camera.", pictures, [])
