@@ -33,7 +33,7 @@ lint: $(STAMP)
 	$(VENV)/bin/lint-imports
 
 docs: $(STAMP)
-	$(VENV)/bin/python -m tofcapture.files.layout > docs/formats.md
+	$(VENV)/bin/python -m tofcapture.files.page > docs/formats.md
 
 clean:
 	rm -rf $(VENV)

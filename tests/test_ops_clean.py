@@ -16,6 +16,8 @@ from tofcapture.poses import exp, transform_points
 
 CAMERA = Camera(160, 128, 144.0, 144.0, 79.5, 63.5)
 
+UP = np.array([0.0, 0.0, 1.0])
+
 
 def rng():
     return np.random.default_rng(0)
@@ -106,7 +108,7 @@ def test_crop_keeps_what_stands_on_the_table():
     depth[:, :12] = 0.6
     depth[100:110, 70:90] = np.nan
     points = CAMERA.unproject(depth)
-    crop = find_crop(points, rng(), radius=0.25)
+    crop = find_crop(points, UP, rng(), radius=0.25)
     kept = inside(crop, points)
     expected = np.zeros(CAMERA.shape, dtype=bool)
     expected[50:80, 60:100] = True
@@ -121,25 +123,36 @@ def test_a_flat_top_that_fills_the_view_is_not_the_table(top):
     depth[:, 15:145] = 1.0 - top
     depth[:12] = 1.7
     points = CAMERA.unproject(depth * (1 + 2e-4 * rng().standard_normal(CAMERA.shape)))
-    crop = find_crop(points, rng(), radius=0.6)
+    crop = find_crop(points, UP, rng(), radius=0.6)
     assert crop.offset == pytest.approx(-1.0, abs=1e-3)
     assert inside(crop, points)[20:, 20:140].mean() == pytest.approx(1.0 if top else 0.0, abs=1e-3)
+
+
+def test_a_steep_wall_that_fills_the_view_is_not_the_table():
+    """Of a large wall and a smaller level plane the level one is the table; without any level plane the wall serves."""
+    generator = rng()
+    wall = generator.uniform([-0.4, -0.3, 0.5], [0.4, -0.3, 1.0], (6000, 3))
+    level = generator.uniform([-0.4, -0.3, 1.0], [0.4, 0.3, 1.0], (2500, 3))
+    assert find_crop(np.concatenate([wall, level]), UP, rng()).normal @ [0, 0, -1] == pytest.approx(
+        1.0, abs=1e-6
+    )
+    assert abs(find_crop(wall, UP, rng()).normal[1]) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_without_a_table_everything_within_range_stays():
     """A ball in mid-air has no dominant plane: all that is near enough is kept."""
     direction = rng().standard_normal((5000, 3))
     points = 0.3 * direction / np.linalg.norm(direction, axis=1, keepdims=True) + [0, 0, 1.0]
-    crop = find_crop(points, rng(), far=1.2)
+    crop = find_crop(points, UP, rng(), far=1.2)
     assert np.isnan(crop.offset)
     np.testing.assert_array_equal(inside(crop, points), points[:, 2] < 1.2)
     assert not inside(crop, np.full((2, 3), np.nan)).any()
-    assert find_crop(np.full((4, 4, 3), np.nan), rng()).far == 2.0
+    assert find_crop(np.full((4, 4, 3), np.nan), UP, rng()).far == 2.0
 
 
 def test_the_same_generator_gives_the_same_crop():
     """The plane search is a function of points and generator."""
     points = CAMERA.unproject(tilted() + 0.001 * rng().standard_normal(CAMERA.shape))
-    first, second = find_crop(points, rng()), find_crop(points, rng())
+    first, second = find_crop(points, UP, rng()), find_crop(points, UP, rng())
     np.testing.assert_array_equal(first.normal, second.normal)
     assert first.offset == second.offset

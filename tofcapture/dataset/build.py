@@ -160,9 +160,11 @@ def build_shard(
     first = read_view(job.views[0])
     info = calibrated(first.tof.info, job.rig)
     errors: list[ViewError] = []
+    good: list[int] = []
     with ShardWriter(path, job.scene, job.rig, info, first.stereo.info, len(job.views)) as shard:
         for done, (sample, error) in enumerate(_samples(job, workers), start=1):
             shard.add(sample)
+            good.append(int((sample.ground_truth[2].mask == 0).sum()))
             errors += [] if error is None else [error]
             if progress:
                 progress(job.scene, done, len(job.views))
@@ -171,7 +173,10 @@ def build_shard(
             "digest": job.digest,
             "config": asdict(job.config),
             "versions": versions(),
-            "views": [{"name": p.name, "sha256": d} for p, d in zip(job.views, job.inputs, strict=True)],
+            "views": [
+                {"name": path.name, "sha256": digest, "good_pixels": pixels}
+                for path, digest, pixels in zip(job.views, job.inputs, good, strict=True)
+            ],
             "gt": None if gt is None else gt.table(),
         }
         return shard.seal(provenance), gt

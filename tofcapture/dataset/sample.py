@@ -64,6 +64,7 @@ def make_sample(view: View, rig: Rig, config: SampleConfig, rng: np.random.Gener
         When the view and the rig are of different cameras, or stereo measured nothing in the ToF camera's view.
     """
     check_cameras(view, rig)
+    T_base_tof = view.arm_before.T_base_flange @ rig.T_flange_tof
     tof = decode_burst(view.tof, calibrated(view.tof.info, rig))
     measured = view.stereo.points[..., 2]
     native = np.where(denoise(measured, rig.stereo), measured, np.nan)
@@ -71,7 +72,7 @@ def make_sample(view: View, rig: Rig, config: SampleConfig, rng: np.random.Gener
     points = register(rig.stereo.unproject(sheet.depth), rig.T_tof_stereo, config.far)
     field = NormalField(np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
     measured_points = np.where(np.isfinite(native)[..., None], points, np.nan)
-    crop = find_crop(measured_points, rng, config.crop_radius, config.far)
+    crop = find_crop(measured_points, T_base_tof[2, :3], rng, config.crop_radius, config.far)
     truths = {}
     for scale in SCALES:
         camera = rig.tof.scaled(scale)
@@ -92,7 +93,7 @@ def make_sample(view: View, rig: Rig, config: SampleConfig, rng: np.random.Gener
         tof=tof,
         native_depth=np.where(inside(crop, measured_points), native, np.nan).astype(np.float32),
         ground_truth=truths,
-        T_base_tof=view.arm_before.T_base_flange @ rig.T_flange_tof,
+        T_base_tof=T_base_tof,
         truth=None if view.truth is None else ExactMaps(view.truth.depth, view.truth.normals),
     )
 

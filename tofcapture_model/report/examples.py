@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -139,10 +140,22 @@ def load_examples(
         A shard is missing or damaged.
     """
     out = []
-    for scene, view in chosen:
-        with ShardReader(Path(dataset) / manifest.scenes[scene].path) as shard:
-            out.append(_example(shard, view, model))
+    with _one_thread():
+        for scene, view in chosen:
+            with ShardReader(Path(dataset) / manifest.scenes[scene].path) as shard:
+                out.append(_example(shard, view, model))
     return out
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sum in one order whatever the number of cores: the same inputs give the same bytes."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @torch.inference_mode()

@@ -18,7 +18,7 @@ from tofcapture_model.report.alignment import alignment
 from tofcapture_model.report.examples import choose, describe_shard, load_examples
 from tofcapture_model.report.panels import panels
 from tofcapture_model.report.rigs import camera_rows, drawing, range_rows, transforms
-from tofcapture_model.report.scores import headline, tables, tiles
+from tofcapture_model.report.scores import headline, sample, tables, tiles
 from tofcapture_model.report.training import Network, load_network, loss_chart, validations
 
 
@@ -128,6 +128,7 @@ def context(sources: Sources, views: int) -> dict[str, Any]:
     return {
         "absent": sources.absent,
         "headline": headline(results) if results else "",
+        "sample": sample(results) if results else "",
         "tiles": tiles(results) if results else [],
         "results": results,
         "tables": tables(results) if results else [],

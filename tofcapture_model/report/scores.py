@@ -122,8 +122,7 @@ def _rank(value: float, better: str) -> float | None:
 
 def headline(results: Mapping[str, Any]) -> str:
     """One sentence: what the network makes of the sensor's error."""
-    kind = "held-out scene" if results["split"] == "test" else f"{results['split']} scene"
-    where = f"On {_count(results.get('views'), 'view')} of {_count(len(results.get('scenes', [])), kind)}"
+    where = f"On {sample(results)}"
     pair = {m: _two(results, m) for m in ("sensor", "model")}
     if None in [v for two in pair.values() for v in two]:
         return f"{where}: there is nothing to compare."
@@ -132,6 +131,12 @@ def headline(results: Mapping[str, Any]) -> str:
         f"{where}, the network's depth is {d1:.2f} mm off on average where the ToF sensor is {d0:.2f} mm off "
         f"({_change(d0, d1)}); its normals are {n1:.1f} degrees off instead of {n0:.1f} ({_change(n0, n1)})."
     )
+
+
+def sample(results: Mapping[str, Any]) -> str:
+    """Say how many views of how many scenes were measured."""
+    kind = "held-out scene" if results["split"] == "test" else f"{results['split']} scene"
+    return f"{_count(results.get('views'), 'view')} of {_count(len(results.get('scenes', [])), kind)}"
 
 
 def _two(results: Mapping[str, Any], method: str) -> tuple[Any, Any]:
