@@ -49,7 +49,14 @@ def way(tmp_path_factory):
         "check": ("check", data),
         "train": ("train", data, "--out", model, "--preset", "demo", "--epochs", 2),
         "evaluate": ("evaluate", data, "--weights", model, "--out", folder / "results.json"),
-        "predict": ("predict", rec / "views/steps/view-000.h5", "--weights", model, "--out", folder / "prediction"),
+        "predict": (
+            "predict",
+            rec / "views/steps/view-000.h5",
+            "--weights",
+            model,
+            "--out",
+            folder / "prediction",
+        ),
         "report": (
             *("report", "--dataset", data, "--results", folder / "results.json", "--weights", model),
             *("--evidence", rec / "evidence.json", "--out", folder / "report.html"),

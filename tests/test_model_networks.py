@@ -45,7 +45,7 @@ def frame(h=36, w=44, batch=2, seed=0):
         valid=torch.ones_like(depth),
         confidence=torch.rand(batch, 1, h, w, generator=g),
         gap=0.05 * torch.randn(batch, 1, h, w, generator=g),
-        cues=0.01 * torch.randn(batch, 3, h, w, generator=g),
+        cues=0.01 * torch.randn(batch, 4, h, w, generator=g),
         intrinsics=k,
     )
 

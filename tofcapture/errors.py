@@ -7,7 +7,7 @@
     ├── ConfigError          3             a TOML file, an option or a value is wrong
     ├── DeviceError          4             a device is missing, silent or refuses
     │   └── MotionRefused    4             the arm must not or cannot go there
-    ├── DataError            5             a file is damaged, foreign, or says something impossible
+    ├── DataError            5             a file is missing, damaged, foreign, or says something impossible
     │   └── FormatError      5             a file's layout is not the one its version promises
     ├── QualityError         6             a gate refused a result (registration, coverage, ground truth)
     └── BusyError            7             someone else holds the recording or the station

@@ -69,12 +69,15 @@ def invert(T: Float64) -> Float64:
 
 def transform_points(T: Float64, points: NDArray[np.floating]) -> Float64:
     """Map points (..., 3) by ``T``; NaN stays NaN."""
-    return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+    return rotate_vectors(T, points) + T[:3, 3]
 
 
 def rotate_vectors(T: Float64, vectors: NDArray[np.floating]) -> Float64:
     """Rotate directions (..., 3) by the rotation of ``T``."""
-    return np.asarray(vectors, dtype=np.float64) @ T[:3, :3].T
+    vectors = np.asarray(vectors, dtype=np.float64)
+    # Flat and contiguous: one product that BLAS takes, instead of one per image row.
+    flat = vectors.reshape(-1, 3) @ np.ascontiguousarray(T[:3, :3].T)
+    return flat.reshape(vectors.shape)
 
 
 def hat(v: ArrayLike) -> Float64:

@@ -26,7 +26,7 @@ class Frame(NamedTuple):
     gap
         (B, 1, H, W) range of the low minus range of the high frequency, metres: the multipath cue.
     cues
-        (B, 3, H, W) depth errors that physics expects, metres: see :func:`tofcapture_model.multipath.cues`.
+        (B, 4, H, W) depth errors that physics expects, metres: see :func:`tofcapture_model.multipath.cues`.
     intrinsics
         (B, 4) fx, fy, cx, cy in pixels of the (H, W) grid.
     """

@@ -1,6 +1,6 @@
 """What the physics of light says about the depth error of a frame, before anything is learned.
 
-Three maps in metres, computed from whole frames (crops do not show the rest of the scene): diffuse interreflection, the halo of the
+Four maps in metres, computed from whole frames (crops do not show the rest of the scene): diffuse interreflection, the halo of the
 lens, and the two frequencies' disagreement. Networks read them and learn how far to believe them.
 """
 
@@ -17,7 +17,7 @@ from tofcapture_model.geometry import plane_normals, rays, side_window_planes
 
 SIGNAL = 0.04  # of saturation: amplitude of a white patch that faces the sensor at 1 m; networks correct it by a factor
 STEP = 8  # pixels per patch
-MARGIN = (
+margin = (
     8  # patches beyond each border, on the planes of the border: the table does not end where the image does
 )
 BOUNCES = 3  # the fourth adds less than the first lacks in knowledge
@@ -28,7 +28,7 @@ _FAINT = 1e-3  # of saturation; below it an amplitude is noise
 
 
 def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: Tensor, hz: float) -> Tensor:
-    """Stack the three maps.
+    """Stack the four maps.
 
     Parameters
     ----------
@@ -43,13 +43,14 @@ def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: 
 
     Returns
     -------
-    (B, 3, H, W) metres: error by interreflection, error by the halo if all light were in it, gap averaged over a wide window
+    (B, 4, H, W) metres: error by interreflection of what is seen, the same with the scene continued beyond the image, error by the halo if all light were in it, gap averaged over a wide window
     """
     high = phasor[:, 2:]
     amplitude = high.square().sum(1, keepdim=True).sqrt()
-    bounce = bounce_error(depth, valid, amplitude, intrinsics, hz)
+    seen = bounce_error(depth, valid, amplitude, intrinsics, hz)
+    beyond = bounce_error(depth, valid, amplitude, intrinsics, hz, step=8, margin=8)
     broad = _blur(gap.clamp(-0.3, 0.3) * valid, 8) / _blur(valid, 8).clamp_min(1e-3)
-    return torch.cat([bounce, halo_error(high, hz), broad], dim=1)
+    return torch.cat([seen, beyond, halo_error(high, hz), broad], dim=1)
 
 
 def _blur(image: Tensor, radius: int) -> Tensor:
@@ -85,7 +86,13 @@ def halo_error(phasor: Tensor, hz: float, shrink: int = 6) -> Tensor:
 
 
 def bounce_error(
-    depth: Tensor, valid: Tensor, amplitude: Tensor, intrinsics: Tensor, hz: float, step: int = STEP
+    depth: Tensor,
+    valid: Tensor,
+    amplitude: Tensor,
+    intrinsics: Tensor,
+    hz: float,
+    step: int = STEP,
+    margin: int = 0,
 ) -> Tensor:
     """Estimate the depth error of diffuse interreflection (after Fuchs 2010 and Jimenez 2014, whom the paper names).
 
@@ -106,6 +113,9 @@ def bounce_error(
         Modulation frequency.
     step
         Pixels per patch; time goes with its inverse fourth power.
+    margin
+        Patches that are added beyond each border on the planes of the border, since the table does not end where the image
+        does; right where the scene goes on, too much where it does not.
 
     Returns
     -------
@@ -122,15 +132,15 @@ def bounce_error(
         :, :, step // 2 :: step, step // 2 :: step
     ]
     h, w = maps.shape[-2:]
-    around = F.pad(maps, (MARGIN, MARGIN, MARGIN, MARGIN), mode="replicate")
-    grid = torch.cat([intrinsics[:, :2] / step, (intrinsics[:, 2:] - step // 2) / step + MARGIN], dim=1)
+    around = F.pad(maps, (margin, margin, margin, margin), mode="replicate")
+    grid = torch.cat([intrinsics[:, :2] / step, (intrinsics[:, 2:] - step // 2) / step + margin], dim=1)
     found = torch.stack(
         [
             _exchange(m.flatten(1), r.flatten(1), g, hz)
             for m, r, g in zip(around, rays(grid, *around.shape[-2:]), grid, strict=True)
         ]
     )
-    inner = found.reshape(-1, 1, *around.shape[-2:])[..., MARGIN : MARGIN + h, MARGIN : MARGIN + w]
+    inner = found.reshape(-1, 1, *around.shape[-2:])[..., margin : margin + h, margin : margin + w]
     return F.interpolate(inner, size=depth.shape[-2:], mode="bilinear", align_corners=False)
 
 

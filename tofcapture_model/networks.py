@@ -17,7 +17,7 @@ from tofcapture_model.frame import Frame
 from tofcapture_model.geometry import plane_normals, rays, side_window_planes, unit
 from tofcapture_model.unet import CONVEX_CHANNELS, UNet, bilinear_logits, convex_upsample
 
-CUE_SCALE = (1.0, 0.01, 0.3)  # what one may expect of each cue: most lenses scatter about one percent
+CUE_SCALE = (1.0, 1.0, 0.01, 0.3)  # what one may expect of each cue: most lenses scatter about one percent
 RESIDUAL_UNIT = 0.01  # m; a head's output of 1 moves the depth by a centimetre
 _PHASOR_FLOOR = 1e-4  # of saturation; below it an amplitude is noise
 
@@ -61,8 +61,8 @@ class CompactInputs(nn.Module):
     def __init__(self, windows: tuple[int, ...]) -> None:
         super().__init__()
         self.windows = windows
-        self.channels = 15 + 4 * len(windows)
-        self.register_buffer("cue_scale", torch.tensor(CUE_SCALE).reshape(1, 3, 1, 1), persistent=False)
+        self.channels = 12 + len(CUE_SCALE) + 4 * len(windows)
+        self.register_buffer("cue_scale", torch.tensor(CUE_SCALE).reshape(1, -1, 1, 1), persistent=False)
         self.cue_scale: Tensor
 
     @torch.no_grad()

@@ -20,7 +20,9 @@ TRAINING_MINUTES = 2.5
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder to fill (default demo-out)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder to fill (default demo-out)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the simulated station (default 0)")
 
 
@@ -42,13 +44,18 @@ class _Steps:
         _say(f"\n[{time.perf_counter() - self.started:5.0f} s] {title}\n  $ tofcapture {' '.join(line)}")
         start = time.perf_counter()
         done = subprocess.run(
-            [sys.executable, "-m", "tofcapture", *line, "--json"], stdout=subprocess.PIPE, text=True, check=False
+            [sys.executable, "-m", "tofcapture", *line, "--json"],
+            stdout=subprocess.PIPE,
+            text=True,
+            check=False,
         )
         self.seconds[title] = round(time.perf_counter() - start, 1)
         try:
             answer: dict[str, Any] = json.loads(done.stdout)
         except json.JSONDecodeError:
-            answer = {"error": {"message": f"no answer, exit code {done.returncode}", "hint": "see the lines above"}}
+            answer = {
+                "error": {"message": f"no answer, exit code {done.returncode}", "hint": "see the lines above"}
+            }
         if done.returncode != 0:
             error = answer.get("error", {"message": json.dumps(answer)[:500], "hint": ""})
             failure = TofError(f"{title}: {error['message']}", hint=error.get("hint", ""))
@@ -64,15 +71,38 @@ def _run(args: argparse.Namespace) -> Outcome:
     out.mkdir(parents=True, exist_ok=True)
     steps = _Steps()
     seed = ("--seed", args.seed)
-    steps.run("record the board with holes", "record", "--calibration", "--views", BOARD_VIEWS, "--out", recording, *seed)
+    steps.run(
+        "record the board with holes",
+        "record",
+        "--calibration",
+        "--views",
+        BOARD_VIEWS,
+        "--out",
+        recording,
+        *seed,
+    )
     recorded = 0
     for scene in SCENES:
-        steps.run(f"record {scene}", "record", "--scene", scene, "--views", SCENE_VIEWS, "--out", recording, *seed)
+        steps.run(
+            f"record {scene}", "record", "--scene", scene, "--views", SCENE_VIEWS, "--out", recording, *seed
+        )
         recorded += len(list((recording / "views" / scene).glob("view-*.h5")))
     aligned = steps.run("align the two cameras", "align", recording)
     built = steps.run("build the shards", "build-dataset", recording, "--out", dataset)
-    true = steps.run("build once more with the true rig", "build-dataset", recording, "--out", checked, "--true-rig")
-    steps.run("train a small network", "train", dataset, "--out", model, "--preset", "demo", "--minutes", TRAINING_MINUTES)
+    true = steps.run(
+        "build once more with the true rig", "build-dataset", recording, "--out", checked, "--true-rig"
+    )
+    steps.run(
+        "train a small network",
+        "train",
+        dataset,
+        "--out",
+        model,
+        "--preset",
+        "demo",
+        "--minutes",
+        TRAINING_MINUTES,
+    )
     steps.run("evaluate on the held-out scene", "evaluate", dataset, "--weights", model, "--out", results)
     table = json.loads(results.read_text(encoding="utf-8"))["methods"]
     steps.run(
@@ -105,15 +135,16 @@ def _row(method: dict[str, Any]) -> dict[str, float]:
 def _text(data: dict[str, Any], recording: Path, dataset: Path, model: Path) -> str:
     number: Callable[[float], str] = "{:9.2f}".format
     rows = [
-        f"  {name:<24}" + "".join(number(data[key][k]) for k in ("mae_mm", "rmse_mm", "median_mm", "normal_mean_deg"))
+        f"  {name:<24}"
+        + "".join(number(data[key][k]) for k in ("mae_mm", "rmse_mm", "median_mm", "normal_mean_deg"))
         for name, key in (("ToF sensor", "sensor"), ("small network", "model"))
     ]
     return "\n".join(
         [
             "",
             f"alignment: {data['align']['rotation_error_deg']:.3f} deg, {data['align']['translation_error_mm']:.2f} mm at 0.8 m off the true rig",
-            f"ground truth: median {data['gt']['median_error_mm']:.2f} mm, 99 % within {data['gt']['p99_error_mm']:.2f} mm with the true rig;"
-            f" median {data['gt_aligned']['median_error_mm']:.2f} mm with the rig as aligned",
+            f"ground truth with the true rig: median {data['gt']['median_error_mm']:.2f} mm, 99 % within {data['gt']['p99_error_mm']:.2f} mm",
+            f"ground truth with the rig as aligned: median {data['gt_aligned']['median_error_mm']:.2f} mm",
             "",
             "  held-out scene           MAE mm  RMSE mm median mm  normal deg",
             *rows,
