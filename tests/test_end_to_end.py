@@ -90,6 +90,15 @@ def test_the_whole_way(way, capsys):
     depth = np.load(next(Path(folder / "prediction").rglob("depth.npy")))
     assert depth.shape[-2:] == (180, 240)
     assert np.isfinite(depth).all()
+    _run_readme_example(folder / "data/shards/steps.h5", capsys)
     html = (folder / "report.html").read_text()
     assert "<script" not in html
     assert f"{1e3 * results['methods']['sensor']['depth']['pixel']['mae']:.1f}" in html
+
+
+def _run_readme_example(shard, capsys):
+    """The README's reading example runs as it stands, on a shard of this dataset."""
+    text = (Path(__file__).parent.parent / "README.md").read_text()
+    code = text.split("```python\n")[1].split("```")[0].replace("demo-out/dataset/shards/mug.h5", str(shard))
+    exec(compile(code, "README.md", "exec"), {})  # noqa: S102
+    assert capsys.readouterr().out.startswith("steps (8, 90, 120)")

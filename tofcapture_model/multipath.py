@@ -17,9 +17,6 @@ from tofcapture_model.geometry import plane_normals, rays, side_window_planes
 
 SIGNAL = 0.04  # of saturation: amplitude of a white patch that faces the sensor at 1 m; networks correct it by a factor
 STEP = 8  # pixels per patch
-margin = (
-    8  # patches beyond each border, on the planes of the border: the table does not end where the image does
-)
 BOUNCES = 3  # the fourth adds less than the first lacks in knowledge
 _WHITEST = 0.9  # albedo
 _FAR = 3.0  # m

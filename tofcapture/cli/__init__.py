@@ -19,6 +19,7 @@ from tofcapture.errors import ConfigError, TofError, UsageError
 
 GROUP = "tofcapture.commands"
 EXIT_CODES = "exit codes: 0 ok, 1 unexpected, 2 usage, 3 config, 4 device, 5 data, 6 quality gate, 7 busy, 130 interrupted"
+DESCRIPTION = "Capture paired ToF raw data and stereo ground truth on a robot arm, build datasets, train networks on them."
 ORDER = (
     "demo",
     "doctor",
