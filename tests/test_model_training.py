@@ -29,6 +29,7 @@ from tofcapture_model.checkpoint import load_model, load_resume
 from tofcapture_model.config import Network, Stage, preset
 from tofcapture_model.data import FrameDataset, SampleId, batched, collate, epoch_batches, mirror
 from tofcapture_model.evaluate import evaluate
+from tofcapture_model.geometry import depth_to_normals, scale_intrinsics
 from tofcapture_model.predict import png_bytes, predict
 from tofcapture_model.train import train
 
@@ -223,14 +224,18 @@ def test_items_depend_on_epoch_and_index_only(dataset):
     assert not torch.equal(first[(2, 1)][0].depth, first[(3, 1)][0].depth)
 
 
-def test_mirroring_twice_is_the_identity_and_flips_normals(dataset):
-    """A mirrored frame is one of a mirrored world."""
+@pytest.mark.parametrize("axis", [-1, -2])
+def test_mirroring_twice_is_the_identity_and_keeps_the_geometry(dataset, axis):
+    """A mirrored frame is one of a mirrored world: plane fits of the mirrored depth are the mirrored normals."""
     data = FrameDataset(dataset, "train")
     frame, target = data[(0, 0)]
-    once = mirror(frame, target)
-    twice = mirror(*once)
-    assert all(torch.equal(a, b) for a, b in zip(frame, twice[0], strict=True))
-    torch.testing.assert_close(once[1].normals[0], -target.normals[0].flip(-1))
+    once = mirror(frame, target, axis)
+    twice = mirror(*once, axis)
+    assert all(torch.allclose(a, b) for a, b in zip(frame, twice[0], strict=True))
+    k = scale_intrinsics(once[0].intrinsics[None], 2)
+    fitted = depth_to_normals(once[1].depth[None], once[1].good[None].float() + 1e-6, k, radius=1)[0]
+    cosine = (fitted * once[1].normals).sum(0)[once[1].good[0]]
+    assert cosine.median() > 0.999
 
 
 def test_processes_share_an_epoch_without_overlap():

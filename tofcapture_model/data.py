@@ -122,15 +122,15 @@ def crop(frame: Frame, target: Target, top: int, left: int, size: tuple[int, int
     return Frame(**maps, intrinsics=frame.intrinsics - shift), Target(*(x[..., rows2, cols2] for x in target))
 
 
-def mirror(frame: Frame, target: Target) -> tuple[Frame, Target]:
-    """Flip left and right: the images, the principal point, and the x of the normals."""
-    maps = {k: v.flip(-1) for k, v in frame._asdict().items() if k != "intrinsics"}
-    fx, fy, cx, cy = frame.intrinsics
-    flipped = Target(*(x.flip(-1) for x in target))
-    intrinsics = torch.stack([fx, fy, frame.depth.shape[-1] - 1 - cx, cy])
-    return Frame(**maps, intrinsics=intrinsics), flipped._replace(
-        normals=flipped.normals * torch.tensor([-1.0, 1.0, 1.0])[:, None, None]
-    )
+def mirror(frame: Frame, target: Target, axis: int = -1) -> tuple[Frame, Target]:
+    """Flip left and right (axis -1) or up and down (axis -2): images, principal point, and that component of the normals."""
+    maps = {k: v.flip(axis) for k, v in frame._asdict().items() if k != "intrinsics"}
+    intrinsics, sign = frame.intrinsics.clone(), torch.ones(3, 1, 1)
+    component = -1 - axis  # x for columns, y for rows
+    intrinsics[2 + component] = frame.depth.shape[axis] - 1 - intrinsics[2 + component]
+    sign[component] = -1
+    flipped = Target(*(x.flip(axis) for x in target))
+    return Frame(**maps, intrinsics=intrinsics), flipped._replace(normals=flipped.normals * sign)
 
 
 class FrameDataset(Dataset[tuple[Frame, Target]]):
@@ -148,7 +148,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
     size
         (height, width) of crops at sensor resolution; () gives whole frames.
     flip
-        Mirror half of the items.
+        Mirror items at random, left to right and top to bottom.
     seed
         Of crops and flips.
     frames
@@ -194,8 +194,9 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         rng = np.random.default_rng([self.seed, epoch, i])
         if self.size:
             frame, target = self._cropped(frame, target, rng)
-        if self.flip and rng.random() < 0.5:
-            frame, target = mirror(frame, target)
+        for axis in (-1, -2) if self.flip else ():
+            if rng.random() < 0.5:
+                frame, target = mirror(frame, target, axis)
         return frame, target
 
     def frame(self, sample: SampleId) -> Frame:

@@ -16,7 +16,7 @@ from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.geometry import plane_normals, rays, side_window_planes
 
 SIGNAL = 0.04  # of saturation: amplitude of a white patch that faces the sensor at 1 m; networks correct it by a factor
-STEP = 8  # pixels per patch
+STEP = 6  # pixels per patch
 BOUNCES = 3  # the fourth adds less than the first lacks in knowledge
 _WHITEST = 0.9  # albedo
 _FAR = 3.0  # m
