@@ -146,6 +146,8 @@ class Training:
         Frames per step and process.
     crop
         (height, width) of training crops at sensor resolution; () takes whole frames.
+    frames
+        Use the first so many frames of every view; 0: all. Frames of a view differ in noise only, and each is decoded once.
     flip
         Mirror frames at random: right as far as the light source stands near the lens.
     schedule
@@ -158,6 +160,7 @@ class Training:
 
     batch: int = 4
     crop: tuple[int, ...] = ()
+    frames: int = 0
     flip: bool = False
     schedule: str = "constant"
     validate_every: int = 0
@@ -165,6 +168,7 @@ class Training:
 
     def __post_init__(self) -> None:
         _require(self.batch > 0, "training.batch", "> 0", self.batch)
+        _require(self.frames >= 0, "training.frames", ">= 0", self.frames)
         _require(
             len(self.crop) in (0, 2) and all(c >= 32 for c in self.crop),
             "training.crop",

@@ -148,7 +148,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
     size
         (height, width) of crops at sensor resolution; () gives whole frames.
     flip
-        Mirror items at random, left to right and top to bottom.
+        Mirror half of the items, left to right.
     seed
         Of crops and flips.
     frames
@@ -194,9 +194,8 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         rng = np.random.default_rng([self.seed, epoch, i])
         if self.size:
             frame, target = self._cropped(frame, target, rng)
-        for axis in (-1, -2) if self.flip else ():
-            if rng.random() < 0.5:
-                frame, target = mirror(frame, target, axis)
+        if self.flip and rng.random() < 0.5:
+            frame, target = mirror(frame, target)
         return frame, target
 
     def frame(self, sample: SampleId) -> Frame:

@@ -16,7 +16,7 @@ from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.geometry import plane_normals, rays, side_window_planes
 
 SIGNAL = 0.04  # of saturation: amplitude of a white patch that faces the sensor at 1 m; networks correct it by a factor
-STEP = 6  # pixels per patch
+STEP = 8  # pixels per patch
 BOUNCES = 3  # the fourth adds less than the first lacks in knowledge
 _WHITEST = 0.9  # albedo
 _FAR = 3.0  # m
@@ -45,7 +45,7 @@ def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: 
     high = phasor[:, 2:]
     amplitude = high.square().sum(1, keepdim=True).sqrt()
     seen = bounce_error(depth, valid, amplitude, intrinsics, hz)
-    beyond = bounce_error(depth, valid, amplitude, intrinsics, hz, step=8, margin=8)
+    beyond = bounce_error(depth, valid, amplitude, intrinsics, hz, margin=8)
     broad = _blur(gap.clamp(-0.3, 0.3) * valid, 8) / _blur(valid, 8).clamp_min(1e-3)
     return torch.cat([seen, beyond, halo_error(high, hz), broad], dim=1)
 

@@ -18,7 +18,6 @@ from tofcapture_model.geometry import plane_normals, rays, side_window_planes, u
 from tofcapture_model.unet import CONVEX_CHANNELS, UNet, bilinear_logits, convex_upsample
 
 CUE_SCALE = (1.0, 1.0, 0.01, 0.3)  # what one may expect of each cue: most lenses scatter about one percent
-GATE_UNIT = 4.0  # full steps to a candidate are common: they must not take hundreds of updates to learn
 RESIDUAL_UNIT = 0.01  # m; a head's output of 1 moves the depth by a centimetre
 _PHASOR_FLOOR = 1e-4  # of saturation; below it an amplitude is noise
 
@@ -62,13 +61,14 @@ class CompactInputs(nn.Module):
     def __init__(self, windows: tuple[int, ...]) -> None:
         super().__init__()
         self.windows = windows
-        self.channels = 10 + len(CUE_SCALE) + 4 * len(windows)
+        self.channels = 12 + len(CUE_SCALE) + 4 * len(windows)
         self.register_buffer("cue_scale", torch.tensor(CUE_SCALE).reshape(1, -1, 1, 1), persistent=False)
         self.cue_scale: Tensor
 
     @torch.no_grad()
     def forward(self, frame: Frame) -> Features:
-        """Compute features; nothing here is learned, and none says where in the image it is: that is how views are memorised."""
+        """Compute features; nothing here is learned."""
+        r = rays(frame.intrinsics, *frame.depth.shape[-2:])
         planes = [side_window_planes(frame.depth, frame.valid + 1e-3, w) for w in self.windows]
         smooth = [1 / c[:, :1].clamp_min(1e-2) for c, _ in planes]
         normals = [plane_normals(c, frame.intrinsics) for c, _ in planes]
@@ -78,6 +78,7 @@ class CompactInputs(nn.Module):
             (frame.gap * 10).clamp(-2, 2),  # 20 MHz is noisy by centimetres
             (frame.cues * self.cue_scale * 100).clamp(-2, 2),  # multipath costs up to some cm
             frame.valid,
+            r[:, :2],
             *((s - frame.depth).mul(50).clamp(-2, 2) for s in smooth),  # noise is some mm
             *((var.sqrt() * 50).clamp(0, 2) for _, var in planes),
             *((n[:, :2]) for n in normals),
@@ -127,7 +128,7 @@ class Raw2Depth(nn.Module):
     def forward(self, shared: Tensor, features: Features, frame: Frame) -> Tensor:
         """Return depth (B, 1, 2H, 2W), metres."""
         gates, residual, logits = self.net(shared).float().split([self.candidates, 1, CONVEX_CHANNELS], dim=1)
-        steps = GATE_UNIT * (gates * (features.candidates - frame.depth)).sum(1, keepdim=True)
+        steps = (gates * (features.candidates - frame.depth)).sum(1, keepdim=True)
         depth = frame.depth + steps + self._bounded(residual * RESIDUAL_UNIT)
         return convex_upsample(depth.clamp_min(0.05), logits + self.bilinear)
 

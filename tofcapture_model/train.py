@@ -118,6 +118,7 @@ def train(
             config.training.crop,
             flip=config.training.flip,
             seed=config.training.seed,
+            frames=config.training.frames,
             cache_bytes=0 if workers else 1.5e9,
         )
         log = Log(out if rank == 0 else None)
