@@ -7,12 +7,13 @@ from tofcapture.camera import Camera
 from tofcapture.devices.sim.light import exact_view, light_at_pixels
 from tofcapture.devices.sim.render import Caster, merge
 from tofcapture.devices.sim.scene import SceneObject
-from tofcapture.devices.sim.transport import Transport, cut_patches, direct, wavenumbers
+from tofcapture.devices.sim.transport import Lamp, Transport, cut_patches, direct, wavenumbers
 from tofcapture.errors import ConfigError
 from tofcapture.ops.phase import radial_to_range, wrapped_range
 from tofcapture.poses import rotation_exp, transform
 
 HZ = (20e6, 100e6)
+CENTRE = Lamp(np.zeros(3))
 CAMERA = Camera(24, 18, 30.0, 30.0, 11.5, 8.5)
 
 
@@ -39,7 +40,7 @@ def ball(radius, centre, albedo, rings=40):
 def render(objects, transport=False, illuminator=(0.007, 0.0, 0.0), **kwargs):
     caster = Caster(merge(objects))
     light = Transport(caster, HZ, 600, 128) if transport else None
-    return light_at_pixels(caster, CAMERA, np.eye(4), np.array(illuminator), HZ, light, **kwargs)
+    return light_at_pixels(caster, CAMERA, np.eye(4), Lamp(np.array(illuminator)), HZ, light, **kwargs)
 
 
 def test_direct_light_decodes_to_the_exact_range():
@@ -58,7 +59,7 @@ def test_irradiance_follows_the_cosine_and_inverse_square_law():
     points = np.array([[0.3, 0.0, 2.0], [0.3, 0.0, 2.0]])
     normals = np.array([[0, 0, -1], [0, 0, 1]], dtype=np.float32)
     k = wavenumbers(HZ)
-    h = direct(caster, points, normals, np.zeros(3), k)
+    h = direct(caster, points, normals, CENTRE, k)
     d = np.hypot(0.3, 2.0)
     np.testing.assert_allclose(h[:, 0], [2.0 / d**3 * np.exp(1j * kk * d) for kk in k], rtol=1e-5)
     assert (h[:, 1] == 0).all()
@@ -71,7 +72,7 @@ def test_a_surface_in_the_way_casts_a_shadow():
         caster,
         np.array([[0.0, 0, 2.0], [1.5, 0, 2.0]]),
         np.array([[0, 0, -1.0]] * 2, np.float32),
-        np.zeros(3),
+        CENTRE,
         (0.0,),
     )
     assert h[0, 0] == 0
@@ -82,7 +83,7 @@ def test_a_surface_in_the_way_casts_a_shadow():
 def test_integrating_sphere(albedo):
     """Inside a sphere lit from its centre all bounces sum to E rho g / (1 - rho g), g the mean of exp(ikr) over chords."""
     transport = Transport(Caster(merge([ball(1.0, (0, 0, 0), albedo, 60)])), HZ, 1200, 128)
-    inside = transport.solve(np.zeros(3)).reshape(3, -1, 2)[:, :, 1]
+    inside = transport.solve(CENTRE).reshape(3, -1, 2)[:, :, 1]
     for k, solved in zip(transport.k, inside, strict=True):
         r = np.linspace(0, 2, 20001)
         g = np.trapezoid(r / 2 * np.exp(1j * k * r), r)
@@ -94,10 +95,10 @@ def test_integrating_sphere(albedo):
 def test_gather_agrees_with_the_patches():
     """The last bounce by rays meets the same closed form as the patch solution."""
     transport = Transport(Caster(merge([ball(1.0, (0, 0, 0), 0.6, 60)])), HZ, 800, 128)
-    solution = transport.solve(np.zeros(3))
+    solution = transport.solve(CENTRE)
     direction = np.array([[0.6, 0.0, 0.8], [0.0, -0.8, 0.6], [0.36, 0.48, -0.8]])
     h = transport.gather(
-        0.998 * direction, -direction.astype(np.float32), np.zeros(3), solution, 256, np.arange(3)
+        0.998 * direction, -direction.astype(np.float32), CENTRE, solution, 256, np.arange(3)
     )
     np.testing.assert_allclose(
         np.abs(h), np.abs(solution[:, 1::2]).mean(axis=1)[:, None].repeat(3, 1), rtol=0.02
@@ -119,7 +120,7 @@ def test_multipath_lengthens_and_grows_with_albedo():
 def test_solution_has_converged():
     """The solution is a fixed point: one more bounce of source plus solution gives the solution back."""
     transport = Transport(Caster(merge([ball(0.5, (0, 0, 0.6), 0.8, 20), wall(1.5, 1.0, 0.8)])), HZ, 300, 64)
-    light = np.array([0.0, 0.1, 0.5])
+    light = Lamp(np.array([0.0, 0.1, 0.5]))
     solution = transport.solve(light)
     source = transport.source(light)
     for matrix, s, h in zip(transport.matrices, source, solution, strict=True):
@@ -141,10 +142,19 @@ def test_a_pixel_on_an_edge_mixes_phasors():
         for name, o in {"both": [near, wall(1.3)], "far": [wall(1.3)], "near": [wall(1.0)]}.items()
     }
     mixed, far, close = (
-        light_at_pixels(caster[n], camera, np.eye(4), np.zeros(3), HZ, None, subpixels=8).phasor[:, 0, 1]
+        light_at_pixels(caster[n], camera, np.eye(4), CENTRE, HZ, None, subpixels=8).phasor[:, 0, 1]
         for n in ("both", "far", "near")
     )
     np.testing.assert_allclose(mixed, (far + close) / 2, rtol=2e-3)
+
+
+def test_a_narrow_lamp_lights_its_cone_only():
+    """Full strength inside the half angle, nothing beyond the edge, falling in between; all round when it is pi."""
+    lamp = Lamp(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.5, 0.2)
+    angle = np.array([0.0, 0.49, 0.6, 0.71, 3.0])
+    towards = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1).astype(np.float32)
+    np.testing.assert_allclose(lamp.strength(towards), [1, 1, 0.5, 0, 0], atol=1e-5)
+    assert CENTRE.strength(towards) == 1.0
 
 
 def test_albedo_scales_direct_light_only():

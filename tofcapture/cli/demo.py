@@ -13,10 +13,10 @@ from typing import Any
 
 from tofcapture.command import Command, Outcome
 
-SCENES = ("mug", "random-1", "steps")
+SCENES = ("random-8", "random-15", "bottle")
 BOARD_VIEWS = 12
-SCENE_VIEWS = 7
-TRAINING_MINUTES = 2.5
+SCENE_VIEWS = 8
+TRAINING_MINUTES = 3
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -150,7 +150,7 @@ def _text(data: dict[str, Any], recording: Path, dataset: Path, model: Path) -> 
             *rows,
             "",
             f"report: {data['report']}   ({data['seconds']['total'] / 60:.1f} minutes in all)",
-            "This network is small and saw two simulated scenes for two and a half minutes; it shows the way, not the limit. Next:",
+            f"This network is small and saw two simulated scenes for {TRAINING_MINUTES} minutes; it shows the way, not the limit. Next:",
             f"  tofcapture record --scene bottle --views 25 --out {recording}",
             f"  tofcapture build-dataset {recording} --out {dataset}",
             f"  tofcapture train {dataset} --out {model}-compact --preset compact",

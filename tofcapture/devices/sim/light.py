@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.render import Caster, Float32
-from tofcapture.devices.sim.transport import Complex64, Transport, direct, wavenumbers
-from tofcapture.poses import Float64, invert, rotate_vectors, transform_points
+from tofcapture.devices.sim.transport import Complex64, Lamp, Transport, direct, wavenumbers
+from tofcapture.poses import Float64, invert, rotate_vectors
 
 _TILE = 4  # interleaved sampling: 4 x 4 neighbouring pixels use 16 different sets of directions
 
@@ -99,7 +99,7 @@ def light_at_pixels(
     caster: Caster,
     camera: Camera,
     T_world_tof: Float64,
-    illuminator: Float64,
+    lamp: Lamp,
     hz: Sequence[float],
     transport: Transport | None,
     subpixels: int = 4,
@@ -113,8 +113,8 @@ def light_at_pixels(
         The scene.
     camera, T_world_tof
         Intrinsics and pose of the ToF camera.
-    illuminator
-        (3,) point light in the ToF frame, metres; it shines equally in all directions.
+    lamp
+        The illuminator, world frame.
     hz
         Modulation frequencies, ascending.
     transport
@@ -125,14 +125,13 @@ def light_at_pixels(
         Rays of the last indirect bounce, per pixel.
     """
     k = wavenumbers(hz)
-    source = transform_points(T_world_tof, illuminator)
     fine = _look(caster, camera.scaled(subpixels), T_world_tof)
     seen = np.flatnonzero(fine.found)
     irradiance = np.zeros((len(k), len(fine.points)), dtype=np.complex64)
-    irradiance[:, seen] = direct(caster, fine.points[seen], fine.normals[seen], source, k)
+    irradiance[:, seen] = direct(caster, fine.points[seen], fine.normals[seen], lamp, k)
     if transport is not None:
         coarse = _look(caster, camera, T_world_tof)
-        indirect = _indirect(coarse, camera, source, transport, rays)
+        indirect = _indirect(coarse, camera, lamp, transport, rays)
         irradiance += _spread(indirect, coarse, fine, camera, subpixels)
     total = np.empty((len(k), *camera.shape), dtype=np.complex128)
     for c, kk in enumerate(k):
@@ -142,17 +141,15 @@ def light_at_pixels(
     return Light(phasor=total[1:], steady=total[0].real)
 
 
-def _indirect(
-    coarse: _Samples, camera: Camera, source: Float64, transport: Transport, rays: int
-) -> Complex64:
+def _indirect(coarse: _Samples, camera: Camera, lamp: Lamp, transport: Transport, rays: int) -> Complex64:
     """Indirect irradiance (K, H * W) at the pixel centres, denoised over the interleaving tile."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
     pattern = ((v % _TILE) * _TILE + u % _TILE).reshape(-1)
     seen = np.flatnonzero(coarse.found)
-    solution = transport.solve(source)
+    solution = transport.solve(lamp)
     h = np.zeros((len(transport.k), len(coarse.points)), dtype=np.complex64)
     h[:, seen] = transport.gather(
-        coarse.points[seen], coarse.normals[seen], source, solution, rays, pattern[seen]
+        coarse.points[seen], coarse.normals[seen], lamp, solution, rays, pattern[seen]
     )
     return _filter(h, coarse, camera)
 

@@ -13,7 +13,7 @@ term, solves, and gathers the last bounce at every pixel with rays, so that near
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,37 @@ from tofcapture.rig import SPEED_OF_LIGHT
 Complex64 = NDArray[np.complex64]
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A point light.
+
+    Attributes
+    ----------
+    position
+        (3,) world frame, metres.
+    axis
+        (3,) unit, where it points.
+    half_angle
+        Full strength within this angle of the axis, radians; from there a smooth step to nothing.
+    edge
+        Width of that step, radians. ``half_angle`` of pi is a lamp that shines equally in all directions.
+    """
+
+    position: NDArray[np.float64]
+    axis: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    half_angle: float = np.pi
+    edge: float = 0.0
+
+    def strength(self, towards: Float32) -> Float32 | float:
+        """(N,) intensity in unit directions (N, 3) away from the lamp, 1 on the axis."""
+        if self.half_angle >= np.pi:
+            return 1.0
+        angle = np.arccos(np.clip(towards @ self.axis.astype(np.float32), -1, 1))
+        t = np.clip((self.half_angle + self.edge - angle) / max(self.edge, 1e-6), 0, 1)
+        out: Float32 = (t * t * (3 - 2 * t)).astype(np.float32)
+        return out
 
 
 def wavenumbers(hz: Sequence[float]) -> tuple[float, ...]:
@@ -154,7 +185,7 @@ def _cosine_directions(normals: Float32, u: NDArray[Any], v: NDArray[Any]) -> Fl
 
 
 def direct(
-    caster: Caster, points: NDArray[Any], normals: Float32, light: NDArray[np.float64], k: Sequence[float]
+    caster: Caster, points: NDArray[Any], normals: Float32, lamp: Lamp, k: Sequence[float]
 ) -> Complex64:
     """Irradiance phasors straight from a point light.
 
@@ -164,21 +195,21 @@ def direct(
         The scene.
     points, normals
         (N, 3), world frame; the normal names the side that is looked at.
-    light
-        (3,) position, world frame, metres.
+    lamp
+        The light.
     k
         Wavenumbers, radians per metre.
 
     Returns
     -------
-    (len(k), N) complex64, ``cos / d^2 exp(i k d)``, zero in shadow and from behind; 1/m^2.
+    (len(k), N) complex64, strength x ``cos / d^2 exp(i k d)``, zero in shadow and from behind; 1/m^2.
     """
-    to_light = light.astype(np.float32) - points.astype(np.float32)
+    to_light = lamp.position.astype(np.float32) - points.astype(np.float32)
     d = np.sqrt(np.einsum("ij,ij->i", to_light, to_light))
     cosine = np.einsum("ij,ij->i", to_light, normals) / d
     lit = cosine > 0
-    lit[lit] = ~caster.blocked(lift(points[lit], normals[lit]), light)
-    h = np.where(lit, cosine / d**2, 0).astype(np.float32)
+    lit[lit] = ~caster.blocked(lift(points[lit], normals[lit]), lamp.position)
+    h = np.where(lit, cosine / d**2, 0).astype(np.float32) * lamp.strength(-to_light / d[:, None])
     return np.stack([h * _turn(kk * d) for kk in k])
 
 
@@ -259,21 +290,21 @@ class Transport:
             out.append(csr_matrix((weight, (row, column)), shape=(sides, sides)))
         return out
 
-    def source(self, light: NDArray[np.float64]) -> Complex64:
+    def source(self, lamp: Lamp) -> Complex64:
         """Irradiance (len(k), 2P) straight from the light, averaged over points of each side of each patch."""
         few = max(1, self._rays // 16)
         pick = (np.arange(2 * self.patches.count)[:, None] * self._rays + np.arange(few) * 16).reshape(-1)
-        source = direct(self.caster, self._points[pick], self._normals[pick], light, self.k)
+        source = direct(self.caster, self._points[pick], self._normals[pick], lamp, self.k)
         out: Complex64 = source.reshape(len(self.k), -1, few).mean(axis=2)
         return out
 
-    def solve(self, light: NDArray[np.float64], tolerance: float = 1e-4) -> Complex64:
+    def solve(self, lamp: Lamp, tolerance: float = 1e-4) -> Complex64:
         """Indirect irradiance phasors of every side of every patch, all bounces.
 
         Parameters
         ----------
-        light
-            (3,) position of the illuminator, world frame, metres.
+        lamp
+            The illuminator.
         tolerance
             Bounces are added until one adds less than this share of the whole.
 
@@ -282,7 +313,7 @@ class Transport:
         (len(k), 2P) complex64, 1/m^2
         """
         out = []
-        for matrix, h in zip(self.matrices, self.source(light), strict=True):
+        for matrix, h in zip(self.matrices, self.source(lamp), strict=True):
             bounce, total = h, np.zeros_like(h)
             for _ in range(500):
                 bounce = matrix @ bounce
@@ -296,7 +327,7 @@ class Transport:
         self,
         points: NDArray[Any],
         normals: Float32,
-        light: NDArray[np.float64],
+        lamp: Lamp,
         solution: Complex64,
         rays: int,
         pattern: Int64,
@@ -307,10 +338,10 @@ class Transport:
         ----------
         points, normals
             (N, 3), world frame.
-        light
-            (3,), world frame.
+        lamp
+            The illuminator.
         solution
-            What :meth:`solve` returned for this light.
+            What :meth:`solve` returned for this lamp.
         rays
             Rays per point.
         pattern
@@ -343,7 +374,7 @@ class Transport:
             r = hits.distance[found]
             met = origins[found] + r[:, None] * directions[found]
             facing = self.caster.facing(hits.triangle[found], directions[found])
-            h = direct(self.caster, met, facing, light, self.k) + solution[:, side[found]]
+            h = direct(self.caster, met, facing, lamp, self.k) + solution[:, side[found]]
             h *= geometry.albedo[hits.triangle[found]] / rays
             owner = found // rays
             for c, kk in enumerate(self.k):

@@ -24,11 +24,11 @@ from tofcapture.devices.sim.render import Caster, merge
 from tofcapture.devices.sim.scene import SceneObject
 from tofcapture.devices.sim.sensor import Sensor, expose
 from tofcapture.devices.sim.stereo import StereoModel, point_map
-from tofcapture.devices.sim.transport import Transport
+from tofcapture.devices.sim.transport import Lamp, Transport
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.frames import StereoFrame, StereoInfo, TofBurst, TofInfo, Truth
 from tofcapture.ops.phase import frequencies
-from tofcapture.poses import Float64, rotation_exp, transform
+from tofcapture.poses import Float64, rotation_exp, transform, transform_points
 from tofcapture.rig import RangeError, Rig, range_error_from
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ class Constants:
 
     tof: Camera
     illuminator: Float64
+    lamp: Mapping[str, float]
     sensor: Sensor
     factory: Mapping[str, float]
     stereo: Camera
@@ -62,7 +63,7 @@ class Constants:
     render: Render
 
 
-TABLES = ("tof", "sensor", "factory", "stereo", "stereo_model", "rig", "render")
+TABLES = ("tof", "lamp", "sensor", "factory", "stereo", "stereo_model", "rig", "render")
 
 
 def default_constants() -> dict[str, Any]:
@@ -109,6 +110,7 @@ def read_constants(overrides: Mapping[str, Any], where: str) -> Constants:
     return Constants(
         tof=_make(Camera, tof, f"{where}: [tof]"),
         illuminator=illuminator,
+        lamp=merged(overrides, where, "lamp"),
         sensor=_make(lambda **v: Sensor(range_errors=errors, **v), sensor, f"{where}: [sensor]"),
         factory=merged(overrides, where, "factory"),
         stereo=_make(Camera, merged(overrides, where, "stereo"), f"{where}: [stereo]"),
@@ -272,11 +274,17 @@ class SimWorld:
         if self._lit is None or self._lit[0] != name:
             caster, transport = self.caster()
             render = self.constants.render
+            T_base_tof = self._pose_of(self.true_rig.T_flange_tof)
+            lamp = Lamp(
+                transform_points(T_base_tof, self.constants.illuminator),
+                T_base_tof[:3, 2],
+                **self.constants.lamp,
+            )
             light = light_at_pixels(
                 caster,
                 self.constants.tof,
-                self._pose_of(self.true_rig.T_flange_tof),
-                self.constants.illuminator,
+                T_base_tof,
+                lamp,
                 frequencies(self.tof_info.modulation_hz),
                 transport,
                 subpixels=render.subpixels,
