@@ -6,7 +6,8 @@ PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-# A GPU build of torch is gigabytes: where there is no NVIDIA driver, take the CPU build.
+# A GPU build of torch is gigabytes. Where there is no NVIDIA driver and pip would find only that one, name the CPU build:
+# make demo TORCH="torch==2.13.0 --index-url ..." with the address that PyTorch's install page gives.
 TORCH ?= $(shell command -v nvidia-smi >/dev/null 2>&1 && echo "torch" || echo "torch==2.13.0")
 
 .PHONY: demo test lint docs clean
@@ -16,7 +17,7 @@ $(STAMP): pyproject.toml
 	$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'tofcapture needs Python 3.11 or newer')"
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)/bin/python -m pip install --quiet "$(TORCH)"
+	$(VENV)/bin/python -m pip install --quiet $(TORCH)
 	$(VENV)/bin/python -m pip install --quiet -e ".[all]" --group dev
 	touch $(STAMP)
 

@@ -87,7 +87,12 @@ def reference_phasors(path: Path, samples: int, depth: int = 24) -> np.ndarray:
     bins, width = 3000, 0.004
     scene = {
         "type": "scene",
-        "integrator": {"type": "transient_path", "max_depth": depth, "rr_depth": depth, "temporal_filter": "box"},
+        "integrator": {
+            "type": "transient_path",
+            "max_depth": depth,
+            "rr_depth": depth,
+            "temporal_filter": "box",
+        },
         "sensor": {
             "type": "perspective",
             "fov": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))),
