@@ -99,6 +99,8 @@ def test_the_whole_way(way, capsys):
 def _run_readme_example(shard, capsys):
     """The README's reading example runs as it stands, on a shard of this dataset."""
     text = (Path(__file__).parent.parent / "README.md").read_text()
-    code = text.split("```python\n")[1].split("```")[0].replace("demo-out/dataset/shards/bottle.h5", str(shard))
+    code = (
+        text.split("```python\n")[1].split("```")[0].replace("demo-out/dataset/shards/bottle.h5", str(shard))
+    )
     exec(compile(code, "README.md", "exec"), {})  # noqa: S102
     assert capsys.readouterr().out.startswith("steps (8, 90, 120)")
