@@ -69,14 +69,15 @@ def invert(T: Float64) -> Float64:
 
 def transform_points(T: Float64, points: NDArray[np.floating]) -> Float64:
     """Map points (..., 3) by ``T``; NaN stays NaN."""
-    return rotate_vectors(T, points) + T[:3, 3]
+    moved: Float64 = rotate_vectors(T, points) + T[:3, 3]
+    return moved
 
 
 def rotate_vectors(T: Float64, vectors: NDArray[np.floating]) -> Float64:
     """Rotate directions (..., 3) by the rotation of ``T``."""
     vectors = np.asarray(vectors, dtype=np.float64)
     # Flat and contiguous: one product that BLAS takes, instead of one per image row.
-    flat = vectors.reshape(-1, 3) @ np.ascontiguousarray(T[:3, :3].T)
+    flat: Float64 = vectors.reshape(-1, 3) @ np.ascontiguousarray(T[:3, :3].T)
     return flat.reshape(vectors.shape)
 
 
