@@ -75,10 +75,10 @@ def transform_points(T: Float64, points: NDArray[np.floating]) -> Float64:
 
 def rotate_vectors(T: Float64, vectors: NDArray[np.floating]) -> Float64:
     """Rotate directions (..., 3) by the rotation of ``T``."""
-    vectors = np.asarray(vectors, dtype=np.float64)
+    given: Float64 = np.asarray(vectors, dtype=np.float64)
     # Flat and contiguous: one product that BLAS takes, instead of one per image row.
-    flat: Float64 = vectors.reshape(-1, 3) @ np.ascontiguousarray(T[:3, :3].T)
-    return flat.reshape(vectors.shape)
+    flat: Float64 = given.reshape(-1, 3) @ np.ascontiguousarray(T[:3, :3].T)
+    return flat.reshape(given.shape)
 
 
 def hat(v: ArrayLike) -> Float64:
