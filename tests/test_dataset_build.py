@@ -177,6 +177,19 @@ def test_build_check_and_read(recording, tmp_path):
         assert shard.provenance["gt"]["p99_error_mm"] <= 3.0
 
 
+@pytest.mark.parametrize("text", ["", "{}", None])
+def test_a_damaged_description_is_found(recording, tmp_path, text):
+    """check reads croissant.json and holds its digests against the manifest."""
+    out = tmp_path / "dataset"
+    build_dataset([recording], out, jobs=1)
+    path = out / "croissant.json"
+    was = path.read_text()
+    path.write_text(
+        was.replace(json.loads(was)["distribution"][0]["sha256"], "0" * 64) if text is None else text
+    )
+    assert [p.path.name for p in check(out)] == ["croissant.json"]
+
+
 def test_a_second_run_does_nothing_and_a_third_repairs(recording, tmp_path):
     """Finished shards are skipped; a damaged one is built again, with the same bytes; a new config builds all anew."""
     out = tmp_path / "dataset"

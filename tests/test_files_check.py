@@ -256,6 +256,7 @@ def test_a_dataset_disagrees_with_its_manifest(here):
         ("gone.h5", ""),
         ("gear.h5", ""),
         ("stray.h5", ""),
+        ("croissant.json", "distribution"),
     }
     assert any("box" in p.where and "is in" in p.message for p in check(dataset))
 

@@ -104,12 +104,24 @@ def _check_dataset(path: Path, tell: Callable[[Path], None]) -> Iterator[Problem
         problems = check_file(path / entry.path, entry.sha256)
         yield from problems or _check_entry(path, name, entry)
     yield from _leaks(path, manifest.scenes)
+    croissant = path / "croissant.json"
+    yield from guarded(croissant, lambda: _check_croissant(croissant, manifest.scenes))
     listed = {(path / e.path).resolve() for e in manifest.scenes.values()}
     for shard in sorted((path / "shards").glob("*.h5")):
         if shard.resolve() not in listed:
             yield Problem(
                 shard, "", "not in the manifest", "run build-dataset with its recording, or delete it"
             )
+
+
+def _check_croissant(path: Path, scenes: Mapping[str, SceneEntry]) -> Iterator[Problem]:
+    """The Croissant description promises the same files as the manifest."""
+    files = _load_json(path)["distribution"]
+    promised = {f["contentUrl"]: f["sha256"] for f in files}
+    if promised != {e.path: e.sha256 for e in scenes.values()}:
+        yield Problem(
+            path, "distribution", "its files or digests differ from the manifest's", "run build-dataset again"
+        )
 
 
 def _check_entry(dataset: Path, name: str, entry: SceneEntry) -> Iterator[Problem]:
