@@ -11,7 +11,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from calibration.clouds import Cloud
+from calibration.projective.backend import register_projective_clouds
 from calibration.registration import Registration, check_clouds, measure_registration
+from calibration.small_gicp_backend import register_small_gicp
 from tofcapture.errors import ConfigError
 from tofcapture.o3d import load_open3d
 from tofcapture.poses import Float64
@@ -94,7 +96,12 @@ def register_kiss_icp(
     return measure_registration(T, source, target)
 
 
-BACKENDS: dict[str, Backend] = {"open3d": register_open3d, "kiss-icp": register_kiss_icp}
+BACKENDS: dict[str, Backend] = {
+    "open3d": register_open3d,
+    "kiss-icp": register_kiss_icp,
+    "projective": register_projective_clouds,
+    "small-gicp": register_small_gicp,
+}
 
 
 def backend_named(name: str) -> Backend:

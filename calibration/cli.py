@@ -8,12 +8,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from calibration.limits import GOOD_ERROR_DEG, GOOD_ERROR_MM
 from tofcapture.command import Command, Outcome
+from tofcapture.errors import ConfigError
 
-GOOD_ERROR_DEG = 0.1  # standard errors that an alignment for ground truth may have
-GOOD_ERROR_MM = 1.0
+if TYPE_CHECKING:
+    from calibration.compare import OldRig
+
 PLAIN_INTERVAL = 5.0  # s between progress lines where stderr is no terminal
 
 
@@ -23,18 +26,31 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--backend", default="open3d", help="open3d (default) or kiss-icp")
     parser.add_argument(
+        "--method",
+        default="averaged",
+        choices=("averaged", "weighted", "joint"),
+        help="averaged (default, the paper's), weighted by information, or joint with the range errors",
+    )
+    parser.add_argument(
         "--initial", type=Path, metavar="RIG.toml", help="start from this rig, not from the views' own"
+    )
+    parser.add_argument(
+        "--compare", type=Path, metavar="OLD_RIG.toml", help="say how far the cameras moved since this rig"
     )
 
 
 def _run(args: argparse.Namespace) -> Outcome:
+    from calibration.compare import drift, drift_table, drift_text, load_old
     from calibration.solve import align
     from tofcapture.rig import load_rig, rig_to_dict
 
     initial = None if args.initial is None else load_rig(args.initial)
+    old = None if args.compare is None else load_old(args.compare)  # before align replaces rig.toml
     with _progress() as progress:
-        rig, evidence = align(args.recording, args.backend, initial, progress)
+        rig, evidence = align(args.recording, args.backend, initial, progress, args.method)
+        page, absent = _page(args.recording, old, evidence, progress)
     paths = {"rig": str(args.recording / "rig.toml"), "evidence": str(args.recording / "evidence.json")}
+    moved = None if old is None else drift(evidence, old)
     summary = {
         key: evidence[key] for key in ("backend", "views", "used", "spread", "standard_error", "pairs")
     }
@@ -44,8 +60,25 @@ def _run(args: argparse.Namespace) -> Outcome:
         **(evidence["truth"] or {}),
         "verdict": verdict(evidence),
         "values": rig_to_dict(rig),
+        "page": page,
+        "drift": None if moved is None else drift_table(moved),
     }
-    return Outcome(data=data, text=f"{table(evidence)}\n{paths['rig']}\n{paths['evidence']}")
+    lines = [table(evidence), *([] if moved is None else [drift_text(moved)])]
+    return Outcome(data=data, text="\n".join([*lines, *paths.values(), page or absent]))
+
+
+def _page(
+    recording: Path, old: OldRig | None, evidence: dict[str, Any], progress: Callable[[str, int, int], None]
+) -> tuple[str | None, str]:
+    """Write evidence.html; its path, or None and why there is none: rig and evidence stand without it."""
+    from calibration.page import write_page
+
+    try:
+        return str(write_page(recording, old, evidence, progress)), ""
+    except ConfigError as err:
+        # An older page would speak of an older alignment.
+        (recording / "evidence.html").unlink(missing_ok=True)
+        return None, f"no evidence.html: {err.message}; {err.hint}"
 
 
 def verdict(evidence: dict[str, Any]) -> str:

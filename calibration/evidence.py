@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 TRUTH_POINT = (0.0, 0.0, 0.8)  # m, ToF frame: the middle of the working volume, where errors are stated
 
 
-def evidence_of(pairs: Sequence[Pair], solution: Solution, backend: str, initial: Float64) -> dict[str, Any]:
+def evidence_of(
+    pairs: Sequence[Pair], solution: Solution, backend: str, initial: Float64, T_tof_stereo: Float64
+) -> dict[str, Any]:
     """Assemble ``evidence.json``.
 
     Parameters
@@ -32,13 +34,14 @@ def evidence_of(pairs: Sequence[Pair], solution: Solution, backend: str, initial
         Name of the registration backend.
     initial
         (4, 4) ``T_tof_stereo`` at the start.
+    T_tof_stereo
+        (4, 4) the result.
 
     Returns
     -------
     dict
         JSON types only; lengths in metres but where a name ends in ``_mm``, angles in degrees.
     """
-    T_tof_stereo = invert(solution.average.T)
     return {
         "format": "tofcapture-evidence",
         "version": 1,

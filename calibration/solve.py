@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from calibration.averaged_icp import Average, average_transforms
 from calibration.backends import COARSE_TO_FINE, FINE, backend_named, register
 from calibration.evidence import evidence_of, write_atomically, write_evidence
+from calibration.methods import apply_method, method_named
 from calibration.pairs import Pair, calibration_views, load_pair
 from calibration.pinned import pinned_worker
 from calibration.range_residual import RangeResidual, fit_range_residual, no_residual
@@ -64,6 +65,7 @@ def align(
     backend: str = "open3d",
     initial: Rig | None = None,
     progress: Progress = lambda _stage, _done, _total: None,
+    method: str = "averaged",
 ) -> tuple[Rig, dict[str, Any]]:
     """Align the cameras of a recording by averaged ICP; write ``evidence.json``, then ``rig.toml``.
 
@@ -80,6 +82,9 @@ def align(
         Rig to start from; by default the one the first view carries.
     progress
         Called with a stage, steps done and steps in all.
+    method
+        ``averaged`` as in the paper, ``weighted`` by each pair's information, or ``joint``: one robust problem over all
+        accepted views that starts at the average and finds the range errors too.
 
     Returns
     -------
@@ -98,6 +103,7 @@ def align(
         Fewer than three pairs pass the gate; nothing is written then.
     """
     backend_named(backend)
+    method_named(method)
     recording = Path(recording)
     paths = calibration_views(recording)
     _demand(len(paths), [None] * len(paths))
@@ -107,8 +113,9 @@ def align(
         pairs.append(load_pair(recording, path))
     start = _common_rig(pairs) if initial is None else initial
     solution = solve(pairs, backend, start.T_tof_stereo, progress)
-    rig = replace(start, T_tof_stereo=invert(solution.average.T))
-    evidence = evidence_of(pairs, solution, backend, start.T_tof_stereo)
+    aligned = apply_method(method, recording, pairs, solution, start)
+    rig = aligned.rig
+    evidence = evidence_of(pairs, solution, backend, start.T_tof_stereo, rig.T_tof_stereo) | aligned.evidence
     write_evidence(recording / "evidence.json", evidence)
     write_atomically(recording / "rig.toml", dumps_rig(rig))
     return rig, evidence

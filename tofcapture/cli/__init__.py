@@ -26,6 +26,7 @@ ORDER = (
     "record",
     "simulate",
     "align",
+    "calibrate",
     "build-dataset",
     "check",
     "train",
@@ -62,9 +63,7 @@ def _load(entry: EntryPoint) -> Command:
 
 def parser(commands: dict[str, Command]) -> argparse.ArgumentParser:
     """Build the parser of the given commands."""
-    top = _Parser(
-        prog="tofcapture", description=__doc__.splitlines()[0] if __doc__ else "", epilog=EXIT_CODES
-    )
+    top = _Parser(prog="tofcapture", description=DESCRIPTION, epilog=EXIT_CODES)
     top.add_argument("--version", action="version", version=f"tofcapture {__version__}")
     subs = top.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     for name, command in commands.items():

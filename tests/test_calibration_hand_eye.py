@@ -1,0 +1,419 @@
+"""Hand-eye: oracles on made and published data, and every refusal by its name."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration import calibrate_cli
+from calibration.hand_eye import refine_from_consensus, solve_hand_eye, to_dict
+from calibration.hand_eye_closed import daniilidis, invert_all, park_martin, residuals, shah
+from calibration.hand_eye_files import read_csv, read_pairs
+from calibration.hand_eye_refine import jacobian
+from calibration.hand_eye_refusal import Cause, HandEyeRefused
+from calibration.time_offset import coarse_offset, make_stream, pairs_at, refine_offset
+from tofcapture.errors import DataError, FormatError, UsageError
+from tofcapture.poses import exp, invert, look_at, rotation_angle, rotation_exp, rotation_log, transform
+
+REAL = Path(__file__).resolve().parents[2] / "shared" / "realdata"
+MOVEIT = REAL / "hand_eye_moveit" / "pose_samples.json"
+ETH = REAL / "hand_eye_ethz" / "robot_arm"
+seeds = st.integers(0, 2**32 - 1)
+few = settings(max_examples=10, deadline=None)
+
+
+def station(seed=0, count=25, noise_m=0.0005, noise_rad=0.001, eye_to_hand=False):
+    """Hand and target poses of a camera that looks at a board from all sides, and the true X."""
+    rng = np.random.default_rng(seed)
+    X = exp(rng.normal(0, [0.06, 0.06, 0.06, 0.8, 0.8, 0.8]))
+    board = transform(np.eye(3), [0.6, 0.1, 0.0])
+    hand, target = [], []
+    for _ in range(count):
+        tilt, turn, far = rng.uniform(0.1, 0.6), rng.uniform(0, 2 * np.pi), rng.uniform(0.4, 0.8)
+        way = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
+        camera = look_at(
+            board[:3, 3] + far * way, board[:3, 3] + rng.normal(0, 0.03, 3), (1, 0, 0), rng.uniform(-1, 1)
+        )
+        B = invert(camera) @ board
+        hand.append(camera @ invert(X))
+        target.append(
+            transform(
+                rotation_exp(rng.normal(0, noise_rad, 3)) @ B[:3, :3], B[:3, 3] + rng.normal(0, noise_m, 3)
+            )
+        )
+    A = np.stack(hand)
+    return (invert_all(A) if eye_to_hand else A), np.stack(target), X
+
+
+def apart(X, Y):
+    return rotation_angle(X[:3, :3] @ Y[:3, :3].T), np.linalg.norm(X[:3, 3] - Y[:3, 3])
+
+
+def refused(hand, target, **how):
+    with pytest.raises(HandEyeRefused) as caught:
+        solve_hand_eye(hand, target, **how)
+    assert str(caught.value.cause) in str(caught.value)
+    return caught.value.cause
+
+
+@given(seed=seeds, eye_to_hand=st.booleans())
+@few
+def test_exact_pairs_give_the_exact_answer(seed, eye_to_hand):
+    """Without noise every method finds X, and the refined one with it."""
+    A, B, X = station(seed, 8, 0, 0, eye_to_hand)
+    result = solve_hand_eye(A, B, eye_to_hand=eye_to_hand)
+    for answer in (result.X, *result.closed_forms.values()):
+        turned, moved = apart(answer, X)
+        assert turned < 1e-6
+        assert moved < 1e-6
+
+
+@pytest.mark.parametrize("method", [park_martin, daniilidis, lambda P, B: shah(P, B)[0]])
+@given(seed=seeds)
+@few
+def test_closed_forms_do_not_see_the_base(method, seed):
+    """Another base frame changes no camera on the flange."""
+    A, B, _ = station(seed, 6, 0.001, 0.003)
+    base = exp(np.random.default_rng(seed).normal(0, 0.5, 6))
+    turned, moved = apart(method(base @ A, B), method(A, B))
+    assert turned < 1e-6
+    assert moved < 1e-6
+
+
+def test_daniilidis_is_blind_to_quaternion_signs():
+    """Rotations beyond half a turn, where quaternions change sign, leave the dual-quaternion answer right."""
+    rng = np.random.default_rng(3)
+    X, Z = exp(rng.normal(0, 0.5, 6)), exp(rng.normal(0, 0.5, 6))
+    A = np.stack([exp(rng.normal(0, [0.3, 0.3, 0.3, 2, 2, 2])) for _ in range(12)])
+    B = np.stack([invert(X) @ invert(a) @ Z for a in A])
+    turned, moved = apart(daniilidis(A, B), X)
+    assert turned < 1e-9
+    assert moved < 1e-9
+
+
+def test_jacobian_is_the_derivative():
+    """The analytic derivative of the residual agrees with finite differences."""
+    A, B, X = station(1, 5)
+    Z = A[0] @ X @ B[0]
+    J, h = jacobian(A, X, Z), 1e-6
+    for k in range(12):
+        step = np.zeros(12)
+        step[k] = h
+        moved = [
+            residuals(
+                A,
+                B,
+                transform(rotation_exp(s * step[3:6]) @ X[:3, :3], X[:3, 3] + s * step[:3]),
+                transform(rotation_exp(s * step[9:]) @ Z[:3, :3], Z[:3, 3] + s * step[6:9]),
+            )
+            for s in (1, -1)
+        ]
+        np.testing.assert_allclose((moved[0] - moved[1]) / (2 * h), J[..., k], atol=2e-3)
+
+
+def test_refined_beats_closed_forms_and_knows_its_error():
+    """Over 12 stations of 40 poses with a camera noisy along its axis, refinement halves the translation error and 1 sigma covers."""
+    ours, best, covered = [], [], []
+    for seed in range(12):
+        A, B, X = station(seed, 40, np.array([0.0003, 0.0003, 0.002]), 0.004)
+        start = refine_from_consensus(A, B)
+        ours.append(apart(start.X, X))
+        best.append(np.min([apart(method(A, B), X) for method in (park_martin, daniilidis)], axis=0))
+        off = np.r_[start.X[:3, 3] - X[:3, 3], rotation_log(start.X[:3, :3] @ X[:3, :3].T)]
+        covered.append(np.abs(off) <= np.sqrt(np.diag(start.covariance)[:6]))
+    assert (np.median(ours, axis=0) < [1, 0.6] * np.median(best, axis=0)).all()
+    assert 0.5 < np.mean(covered) < 0.85
+
+
+def test_leaving_one_out_is_solving_without_it():
+    """The one-step left-out residual is that of a solution that never saw the pair."""
+    A, B, _ = station(2, 20)
+    result = solve_hand_eye(A, B)
+    rest = np.arange(20) != 7
+    without = refine_from_consensus(A[rest], B[rest])
+    expected = residuals(A[7:8], B[7:8], without.X, without.Z)[0]
+    assert np.abs(result.left_out[7] - expected).max() < 0.1 * np.abs(expected).max()
+    assert result.leave_one_out[0] > np.sqrt(np.mean(np.sum(result.residual[:, :3] ** 2, axis=1)))
+
+
+def test_outliers_lose_their_vote():
+    """Two exchanged target poses among 25 are named and move the answer by less than its error bar."""
+    A, B, X = station(4)
+    B[[3, 11]] = B[[11, 3]]
+    result = solve_hand_eye(A, B)
+    assert np.flatnonzero(result.outliers).tolist() == [3, 11]
+    assert "[3, 11]" in result.warnings[0]
+    assert apart(result.X, X)[1] < 4 * result.sigma[0]
+
+
+def test_motion_without_rotation_is_refused():
+    """Pure translation, a single axis, tiny rotations and too few pairs are each refused by name, with arm and camera noise."""
+    rng = np.random.default_rng(0)
+    X, Z = exp([0.05, 0.02, 0.08, 0.3, -0.5, 0.8]), exp([0.6, 0, 0, 0, 0, 0.4])
+
+    def pairs(twists):
+        A = np.stack([exp(t) @ exp([0.4, 0, 0.5, 2, 1, 0]) for t in twists])
+        B = np.stack([invert(X) @ invert(a) @ Z @ exp(rng.normal(0, 1e-3, 6)) for a in A])
+        return A @ np.stack([exp(rng.normal(0, 3e-4, 6)) for _ in A]), B
+
+    place = rng.normal(0, 0.2, (20, 3))
+    axis = np.outer(rng.uniform(-1, 1, 20), [0.2, -0.4, 0.9])
+    assert refused(*pairs(np.c_[place, 0 * place])) == Cause.PURE_TRANSLATION
+    assert refused(*pairs(np.c_[place, axis])) == Cause.SINGLE_AXIS
+    assert refused(*pairs(np.c_[place, rng.normal(0, 0.012, (20, 3))])) == Cause.SMALL_ROTATIONS
+    A, B, _ = station()
+    assert refused(A[:2], B[:2]) == Cause.TOO_FEW
+    assert refused(A[:0], B[:0]) == Cause.TOO_FEW
+    assert refused(A, np.repeat(B[:1], len(B), axis=0)) == Cause.SHUFFLED
+
+
+S = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def scaled(T, factor):
+    out = T.copy()
+    out[:, :3, 3] *= factor
+    return out
+
+
+def reordered(T):
+    from scipy.spatial.transform import Rotation
+
+    out = T.copy()
+    out[:, :3, :3] = Rotation.from_quat(
+        np.roll(Rotation.from_matrix(T[:, :3, :3]).as_quat(), 1, axis=1)
+    ).as_matrix()
+    return out
+
+
+MISTAKES = {
+    "shuffled": (
+        lambda A, B: (A, np.roll(B, 7, axis=0)[np.random.default_rng(0).permutation(25)]),
+        Cause.SHUFFLED,
+    ),
+    "half shuffled": (lambda A, B: (A, np.r_[B[12:0:-1], B[:1], B[13:]]), Cause.SHUFFLED),
+    "one missing": (lambda A, B: (A[1:], B[:-1]), Cause.SHIFTED),
+    "hand inverted": (lambda A, B: (invert_all(A), B), Cause.EYE_CONFUSED),
+    "columns swapped": (lambda A, B: (B, A), Cause.SWAPPED),
+    "target in mm": (lambda A, B: (A, scaled(B, 1000)), Cause.WRONG_UNITS),
+    "hand in mm": (lambda A, B: (scaled(A, 1000), B), Cause.WRONG_UNITS),
+    "target in inches": (lambda A, B: (A, scaled(B, 1 / 0.0254)), Cause.WRONG_UNITS),
+    "wrong square size": (lambda A, B: (A, scaled(B, 1.4)), Cause.TARGET_SCALE),
+    "target mirrored": (lambda A, B: (A, S @ B @ S), Cause.MIRRORED),
+    "hand mirrored": (lambda A, B: (S @ A @ S, B), Cause.MIRRORED),
+    "y of the hand reversed": (lambda A, B: (scaled(A, np.array([1, -1, 1])), B), Cause.MIRRORED),
+    "x of the target reversed": (lambda A, B: (A, scaled(B, np.array([-1, 1, 1]))), Cause.MIRRORED),
+    "quaternions w first": (lambda A, B: (A, reordered(B)), Cause.QUATERNION_ORDER),
+    "two boards": (
+        lambda A, B: (
+            A,
+            np.where((np.arange(len(B)) % 2)[:, None, None], B @ exp([0.1, 0.05, 0, 0, 0, 3]), B),
+        ),
+        Cause.TWO_BOARDS,
+    ),
+    "board moved": (lambda A, B: (A, np.r_[B[:14], B[14:] @ exp([0.1, 0.05, 0, 0, 0, 0.5])]), Cause.MOVED),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_are_named(mistake):
+    """Every common mistake is refused, in the hand and beside the arm, by its cause and with a hint."""
+    make, cause = MISTAKES[mistake]
+    A, B, _ = station(5)
+    assert refused(*make(A, B)) == cause
+
+
+@pytest.mark.parametrize("eye_to_hand", [False, True])
+def test_the_other_mount_is_named(eye_to_hand):
+    """Eye-in-hand data solved as eye-to-hand, and the reverse, are refused as confused."""
+    A, B, _ = station(6, eye_to_hand=eye_to_hand)
+    assert refused(A, B, eye_to_hand=not eye_to_hand) == Cause.EYE_CONFUSED
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda T: np.where(np.arange(25)[:, None, None] == 3, np.nan, T), "NaN or infinity in pair 3"),
+        (lambda T: T @ S, "left-handed"),
+        (lambda T: T * 2, "no rotation"),
+        (lambda T: np.swapaxes(T, 1, 2), "last row"),
+        (lambda T: T[:, :3], "shape"),
+        (lambda T: T[:-1], "as many target poses"),
+    ],
+)
+def test_damaged_poses_are_data_errors(spoil, says):
+    """NaN, mirrored, scaled and transposed matrices and unequal lists are said to be what they are."""
+    A, B, _ = station()
+    with pytest.raises(DataError, match=says):
+        solve_hand_eye(A, spoil(B))
+
+
+@pytest.mark.realdata
+@pytest.mark.skipif(not MOVEIT.exists(), reason="needs ../shared/realdata")
+def test_moveit_gives_the_published_answer():
+    """MoveIt's real pairs give its published translation within 1 % and rotation within 1 %; eye-in-hand fails by name."""
+    hand, target = read_pairs(MOVEIT)
+    result = solve_hand_eye(hand, target, eye_to_hand=True)
+    rx, ry, rz = (rotation_exp(a * e) for a, e in zip((0.230, -2.540, 1.950), np.eye(3), strict=True))
+    truth = transform(rx @ ry @ rz, [0.659, -0.249, 0.830])
+    np.testing.assert_allclose(result.X[:3, 3], truth[:3, 3], rtol=0.01)
+    assert np.abs(result.X - truth).max() < 0.01
+    assert not result.outliers.any()
+    assert refused(hand, target) == Cause.EYE_CONFUSED
+    assert refused(hand, np.random.default_rng(0).permutation(target), eye_to_hand=True) == Cause.SHUFFLED
+
+
+@pytest.mark.realdata
+@pytest.mark.skipif(not ETH.exists(), reason="needs ../shared/realdata")
+def test_eth_streams_repeat():
+    """A real arm's two halves of a stream agree within a centimetre and 0.3 degrees; its target poses are named inverted."""
+    hand = make_stream(*read_csv(next(ETH.glob("*hinge.csv"))), "hand")
+    seconds, poses = read_csv(next(ETH.glob("*target_ir.csv")))
+    A, B = pairs_at(hand, make_stream(seconds, invert_all(poses), "target"), -0.0157)
+    one, two = (solve_hand_eye(A[s], B[s], blocks=10) for s in (slice(0, 100), slice(100, 200)))
+    turned, moved = apart(one.X, two.X)
+    assert moved < 0.01
+    assert turned < np.radians(0.3)
+    assert refused(A, invert_all(B)) == Cause.TARGET_INVERTED
+
+
+def streams(offset, seed=0, period=None):
+    """A smooth irregular (or periodic) motion, seen by a hand at 100 Hz and a camera at 30 Hz whose clock is off."""
+    rng = np.random.default_rng(seed)
+    X, Z = exp([0.05, 0.02, 0.08, 0.3, -0.5, 0.8]), exp([0.6, 0, 0, 0, 0, 0.4])
+    rate = rng.uniform(0.5, 3, (4, 6)) if period is None else np.full((4, 6), 2 * np.pi / period)
+    phase, size = rng.uniform(0, 6, (4, 6)), np.r_[[0.04] * 3, [0.25] * 3]
+
+    def at(t):
+        return exp(size * np.sin(rate * t + phase).sum(axis=0))
+
+    t_hand, t_camera = np.arange(0, 20, 0.01), np.arange(1, 18, 1 / 30)
+    hand = np.stack([at(t) for t in t_hand])
+    target = np.stack([invert(X) @ invert(at(t)) @ Z @ exp(rng.normal(0, 5e-4, 6)) for t in t_camera])
+    return make_stream(t_hand, hand, "hand"), make_stream(t_camera - offset, target, "target"), X
+
+
+@pytest.mark.parametrize("offset", [0.137, 1e6])
+def test_time_offset_is_found(offset):
+    """Clocks that differ by a few frames or by an epoch are brought together to two milliseconds."""
+    hand, target, X = streams(offset)
+    start, correlation = coarse_offset(hand, target)
+    found, sigma = refine_offset(
+        hand, target, start, lambda A, B: -refine_from_consensus(A, B).log_likelihood
+    )
+    assert abs(start - offset) < 0.03
+    assert correlation > 0.8
+    assert abs(found - offset) < 0.002
+    assert sigma < 0.002
+    assert apart(solve_hand_eye(*pairs_at(hand, target, found), blocks=10).X, X)[1] < 0.002
+
+
+def test_time_offset_of_foreign_or_periodic_streams_is_refused():
+    """Streams of different motions, and motion that repeats itself, have no offset."""
+    hand, target, _ = streams(0.1, period=2.0)
+    other = streams(0.1, seed=9)[1]
+    for second in (target, other):
+        with pytest.raises(HandEyeRefused) as caught:
+            coarse_offset(hand, second)
+        assert caught.value.cause == Cause.TIME_OFFSET
+
+
+def args(*words):
+    parser = argparse.ArgumentParser()
+    calibrate_cli.COMMAND.configure(parser)
+    return parser.parse_args([str(w) for w in words])
+
+
+def test_command_reads_pairs_and_writes_json(tmp_path):
+    """calibrate hand-eye takes JSON pairs and CSV pairs alike, prints a table and writes the same numbers."""
+    from scipy.spatial.transform import Rotation
+
+    A, B, X = station(7)
+    (tmp_path / "pairs.json").write_text(
+        json.dumps([[a.tolist(), b.tolist()] for a, b in zip(A, B, strict=True)])
+    )
+    for name, T in (("hand.csv", A), ("target.csv", B)):
+        rows = np.c_[np.arange(len(T)), T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()]
+        np.savetxt(
+            tmp_path / name, rows, delimiter=",", header="t,x,y,z,qx,qy,qz,qw", fmt="%.12f", comments=""
+        )
+    out = tmp_path / "result.json"
+    one = calibrate_cli.COMMAND.run(args("hand-eye", tmp_path / "pairs.json", "--out", out))
+    two = calibrate_cli.COMMAND.run(args("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv"))
+    written = json.loads(out.read_text())
+    np.testing.assert_allclose(written["T_flange_camera"], two.data["T_flange_camera"], atol=1e-8)
+    assert apart(np.array(written["T_flange_camera"]), X)[1] < 0.002
+    assert "standard error" in one.text
+    assert written["leave_one_out"] is not None
+    inverted = tmp_path / "inverted.json"
+    inverted.write_text(json.dumps([[a.tolist(), invert(b).tolist()] for a, b in zip(A, B, strict=True)]))
+    same = calibrate_cli.COMMAND.run(args("hand-eye", inverted, "--inverted-target"))
+    np.testing.assert_allclose(same.data["T_flange_camera"], written["T_flange_camera"], atol=1e-6)
+
+
+def test_command_finds_the_offset_of_streams(tmp_path):
+    """Two CSV streams with clocks apart are brought together and solved in one call."""
+    from scipy.spatial.transform import Rotation
+
+    hand, target, X = streams(0.25)
+    for name, stream in (("hand.csv", hand), ("target.csv", target)):
+        T = stream.poses
+        np.savetxt(
+            tmp_path / name,
+            np.c_[stream.seconds, T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()],
+            fmt="%.9f",
+        )
+    data = calibrate_cli.COMMAND.run(args("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv")).data
+    assert abs(data["time_offset_s"] - 0.25) < 0.002
+    assert apart(np.array(data["T_flange_camera"]), X)[1] < 0.002
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("", FormatError),
+        ("[]", DataError),
+        ("{}", FormatError),
+        ("[[1, 2]]", FormatError),
+        ("[[[[1]], [[2]]]]", FormatError),
+    ],
+)
+def test_bad_pair_files_are_named(tmp_path, text, kind):
+    """Files that hold no pairs say so with their path."""
+    path = tmp_path / "pairs.json"
+    path.write_text(text)
+    with pytest.raises(kind, match=r"pairs\.json"):
+        read_pairs(path)
+    with pytest.raises(DataError, match="no such file"):
+        read_pairs(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "t,x\n", "0,1,2,3,0,0,0,1\n0,1,2\n", "0,1,2,3,1,1,0,1\n", "0,nan,2,3,0,0,0,1\n"]
+)
+def test_bad_csv_files_are_named(tmp_path, text):
+    """Streams with missing columns, NaN or quaternions that are none say so with their path."""
+    path = tmp_path / "hand.csv"
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"hand\.csv"):
+        read_csv(path)
+
+
+def test_command_refuses_three_files():
+    """More than two files are a usage error."""
+    with pytest.raises(UsageError):
+        calibrate_cli.COMMAND.run(args("hand-eye", "a.csv", "b.csv", "c.csv"))
+
+
+def test_result_is_json(tmp_path):
+    """A result of three pairs, with nothing to leave out, is still valid JSON."""
+    A, B, _ = station(8, 3)
+    data = to_dict(solve_hand_eye(A, B))
+    assert json.loads(json.dumps(data, allow_nan=False))["pairs"] == 3
+    assert any("only 3 pairs" in text for text in data["warnings"])

@@ -1,0 +1,252 @@
+"""Joint alignment on made boards: exact recovery, honest covariance, and what a lone plane cannot tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibration.clouds import Cloud
+from calibration.fusion import about, fuse, twist_about
+from calibration.joint_icp import joint_icp
+from calibration.joint_rims import _shares
+from calibration.joint_views import HALO_RADII, JointView, halo_errors
+from calibration.methods import joint_evidence, method_named
+from calibration.observability import motion_name, observability, plane_information, suggest_view
+from calibration.range_error import TERMS, composed
+from calibration.rims import Rims
+from tofcapture import poses
+from tofcapture.camera import Camera
+from tofcapture.errors import ConfigError, DataError, QualityError
+from tofcapture.rig import SPEED_OF_LIGHT, RangeError
+
+CAMERA = Camera(240, 180, 190.6186, 200.7526, 116.8406, 101.4767)
+TRUE = poses.transform(poses.rotation_exp([0.045, 0.012, 0.009]), [-0.05, 0.075, 0.004])
+GUESS = poses.exp([0.004, -0.003, 0.004, 0.01, -0.012, 0.008]) @ TRUE
+HZ = (20e6, 100e6)
+HALF = (0.25, 0.20)  # m, half a board
+
+
+def errors_at(range_, radius_px, error):
+    """Range error (N,) of a RangeError at true ranges."""
+    return error.at(4 * np.pi * error.modulation_hz / SPEED_OF_LIGHT * range_, radius_px, 45.0)
+
+
+def made_view(index, rng, errors=(), noise=0.0, bias=0.0, away=None, rims=True):
+    """A board tilted 20 to 40 degrees, with range errors, noise, and a bias of its own that is linear over the image."""
+    tilt, turn = np.radians(rng.uniform(20, 40)), 2.399963 * index
+    away = 0.5 + 0.6 * ((index * 0.618) % 1) if away is None else away
+    normal = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
+    centre = np.array([0.0, 0.0, away])
+    a = np.cross(normal, [np.sin(index), np.cos(index), 0.0])
+    a /= np.linalg.norm(a)
+    b = np.cross(normal, a)
+    pixels = CAMERA.rays[::5, ::5].reshape(-1, 3)
+    unit = pixels / np.linalg.norm(pixels, axis=1, keepdims=True)
+    radial = (normal @ centre) / (unit @ normal)
+    on = (np.abs((unit * radial[:, None] - centre) @ np.stack([a, b], 1)) < HALF).all(axis=1)
+    unit, radial = unit[on], radial[on]
+    radius = np.hypot(unit[:, 0] / unit[:, 2] * CAMERA.fx, unit[:, 1] / unit[:, 2] * CAMERA.fy)
+    own = unit[:, :2] @ rng.normal(0, 2 * bias, 2) + rng.normal(0, bias)
+    by_hz = {e.modulation_hz: e for e in errors}
+    ranges = np.stack(
+        [
+            radial
+            + own
+            + rng.normal(0, k * noise, len(radial))
+            + errors_at(radial, radius, by_hz.get(f, RangeError(f)))
+            for f, k in zip(HZ, (4, 1), strict=True)
+        ]
+    )
+    side = np.linspace(-0.25, 0.25, 101)
+    grid = centre + side[:, None, None] * a + side[None, :81, None] * b * 1.0
+    back = poses.invert(TRUE)
+    surface = Cloud(
+        poses.transform_points(back, grid.reshape(-1, 3)),
+        np.tile(poses.rotate_vectors(back, normal), (grid[..., 0].size, 1)),
+    )
+    edge, outward = board_rims(centre, a, b)
+    seen = edge * (1 + rng.normal(0, 0.2 * noise, len(edge)))[:, None] + outward * rng.normal(
+        0, 0.3 * noise, (len(edge), 1)
+    )
+    across = np.cross(np.where(np.abs(outward @ a)[:, None] > 0.5, b, a), edge)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    image = np.where(np.abs(outward[:, :1]) > np.abs(outward[:, 1:2]), [1.0, 0, 0], [0, 1.0, 0]) * np.sign(
+        outward
+    )
+    held = Cloud(poses.transform_points(back, edge), poses.rotate_vectors(back, across))
+    kept = len(edge) if rims else 0
+    return JointView(
+        name=f"view-{index:03d}",
+        camera=CAMERA,
+        illuminator=np.zeros(3),
+        modulation_hz=HZ,
+        rays=unit,
+        radius_px=radius,
+        ranges=ranges,
+        sigma=np.stack([np.full(len(unit), max(k * noise, 5e-4)) for k in (4, 1)]),
+        halos=np.zeros((2, len(unit), len(HALO_RADII))),
+        celsius=45.0,
+        rims=Rims(seen[:kept], image[:kept]),
+        factory=(),
+        surface=surface,
+        held=held,
+        truth=TRUE,
+    )
+
+
+def board_rims(centre, a, b):
+    """Points (N, 3) on a board's outline and the directions outward."""
+    s = np.linspace(-0.95, 0.95, 60)[:, None]
+    parts = [(centre + k * HALF[0] * a + s * HALF[1] * b, k * a) for k in (-1, 1)]
+    parts += [(centre + k * HALF[1] * b + s * HALF[0] * a, k * b) for k in (-1, 1)]
+    return np.concatenate([p for p, _ in parts]), np.concatenate([np.tile(o, (60, 1)) for _, o in parts])
+
+
+def test_fusion_is_the_weighted_mean_of_small_motions():
+    """For small motions the fused twist is (sum H)^-1 sum H xi."""
+    rng = np.random.default_rng(0)
+    xi = 1e-5 * rng.standard_normal((5, 6))
+    H = [A @ A.T + 0.1 * np.eye(6) for A in rng.standard_normal((5, 6, 6))]
+    fused = fuse([TRUE @ poses.exp(x) for x in xi], H)
+    expected = np.linalg.solve(np.sum(H, axis=0), np.einsum("nij,nj->i", np.array(H), xi))
+    np.testing.assert_allclose(poses.log(poses.invert(TRUE) @ fused.T), expected, atol=1e-9)
+
+
+def test_fusion_of_large_motions_is_stationary():
+    """At the fused transform no small motion lowers the cost, however far the transforms lie apart."""
+    rng = np.random.default_rng(1)
+    T = [TRUE @ poses.exp(0.3 * rng.standard_normal(6)) for _ in range(4)]
+    H = [A @ A.T + np.eye(6) for A in rng.standard_normal((4, 6, 6))]
+
+    def cost(S):
+        return sum(
+            float(e @ h @ e) for t, h in zip(T, H, strict=True) for e in [poses.log(poses.invert(t) @ S)]
+        )
+
+    fused = fuse(T, H)
+    assert fused.chi2 == pytest.approx(cost(fused.T))
+    for d in np.concatenate([np.eye(6), -np.eye(6)]) * 1e-2:
+        assert cost(fused.T @ poses.exp(d)) > fused.chi2
+
+
+def test_fusion_demands_that_every_motion_is_held():
+    """Informations that together leave a motion free are a data error."""
+    with pytest.raises(DataError, match="undetermined"):
+        fuse([TRUE, TRUE], [np.diag([1.0, 1, 1, 1, 1, 0])] * 2)
+
+
+def test_information_moves_with_its_centre():
+    """A twist costs the same about the origin and about a centre."""
+    rng = np.random.default_rng(2)
+    A = rng.standard_normal((6, 6))
+    centre, xi = rng.standard_normal(3), rng.standard_normal(6)
+    there = np.r_[xi[:3] + np.cross(xi[3:], centre), xi[3:]]
+    assert xi @ about(A @ A.T, centre) @ xi == pytest.approx(there @ A @ A.T @ there)
+
+
+def test_joint_recovers_transform_and_range_errors():
+    """An offset of 17 mm, 6 mm waves and a radial term come off to 1 mm RMS over 0.3 to 1.5 m; the transform is found exactly."""
+    rng = np.random.default_rng(3)
+    wrong = (
+        RangeError(20e6, offset=0.010),
+        RangeError(100e6, offset=0.017, harmonics=((2, 0.006, 0.001),), per_pixel_radius=2e-5),
+    )
+    views = [made_view(i, rng, wrong, 3e-4, away=0.35 + 0.09 * i) for i in range(12)]
+    found = joint_icp(views, GUESS)
+    error = twist_about(found.T_tof_stereo @ poses.invert(TRUE), found.centre)
+    assert np.linalg.norm(error[:3]) < 3e-4
+    assert np.degrees(np.linalg.norm(error[3:])) < 0.03
+    high = composed((), HZ, found.range_coefficients)[1]
+    range_ = np.linspace(0.3, 1.5, 200)
+    left = errors_at(range_, 40.0, wrong[1]) - errors_at(range_, 40.0, high)
+    assert np.sqrt(np.mean(left**2)) < 1e-3
+
+
+def test_stated_sigmas_cover_the_error():
+    """With bias of its own in every view, one sigma holds the error about as often as it should: 72 components."""
+    inside = []
+    for seed in range(12):
+        rng = np.random.default_rng([4, seed])
+        found = joint_icp([made_view(i, rng, noise=1e-3, bias=1e-3) for i in range(8)], GUESS)
+        error = twist_about(found.T_tof_stereo @ poses.invert(TRUE), found.centre)
+        inside.append(np.abs(error) < np.sqrt(np.diag(found.covariance)))
+    assert 0.5 < np.mean(inside) < 0.97
+
+
+def test_joint_refuses_what_does_not_overlap():
+    """Too few views, or a guess half a metre off, are quality errors."""
+    views = [made_view(i, np.random.default_rng(5)) for i in range(3)]
+    with pytest.raises(QualityError, match="at least 3"):
+        joint_icp(views[:2], GUESS)
+    with pytest.raises(QualityError, match="overlap"):
+        joint_icp(views, poses.exp([0.5, 0.5, 0.5, 0, 0, 0]) @ TRUE)
+
+
+def test_lone_plane_leaves_its_own_motions_unconstrained():
+    """A facing plane without holes slides in x and y and turns about z, and is said to."""
+    centre = np.array([0.0, 0.0, 0.8])
+    seen = observability(plane_information(np.array([0.0, 0.0, -1.0]), centre, centre))
+    assert len(seen.unconstrained) == 3
+    said = " ".join(seen.unconstrained)
+    assert all(name in said for name in ("along x", "along y", "about z"))
+    assert motion_name(seen.motions[-1]) in {"along z (1.00)", "about x (1.00)", "about y (1.00)"}
+
+
+def test_suggested_view_helps_the_weakest_motion():
+    """What is suggested lowers the largest sigma, and tilts in the direction that is weak."""
+    centre = np.array([0.0, 0.0, 0.8])
+    base = np.diag([1e4, 1e8, 1e8, 1e7, 1e7, 1e7])
+    hint = suggest_view(base, centre)
+    assert hint["motion"].startswith("along x")
+    assert hint["expected_sigma_mm"] < hint["sigma_mm"]
+    assert hint["towards_deg"] % 180 == 0
+
+
+def test_range_errors_add_to_the_factory_s():
+    """Fitted terms are added to the factory's, order by order; what was not fitted stays."""
+    own = np.zeros(2 * TERMS + len(HALO_RADII))
+    own[TERMS : TERMS + 4] = [0.001, 1e-5, 0.002, 0.003]
+    factory = (RangeError(100e6, offset=-0.7, harmonics=((2, 0.006, 0.0),), per_kelvin=1e-4),)
+    low, high = composed(factory, HZ, own)
+    assert high.offset == pytest.approx(-0.699)
+    assert high.per_kelvin == 1e-4
+    assert {m: (a, b) for m, a, b in high.harmonics}[1] == (0.002, 0.003)
+    assert {m: (a, b) for m, a, b in high.harmonics}[2] == (0.006, 0.0)
+    assert low.modulation_hz == 20e6
+
+
+def test_shadowed_pixel_has_no_less_front():
+    """A pixel of front, back and dark gives the front's share, and says that the rest is dark."""
+    front, back = np.array([[2.0 + 1j], [0.5 - 1j]]), np.array([[0.4 - 0.3j], [0.6 + 0.8j]])
+    mixed = 0.3 * front + 0.5 * back
+    share, lit, apart = _shares(mixed[..., None], front, back)
+    assert share[0, 0] == pytest.approx(0.3)
+    assert lit[0, 0] == pytest.approx(0.8)
+    assert apart[0] > 0.15
+
+
+def test_halo_lengthens_a_dark_front_before_a_bright_back():
+    """Light scattered from a deeper background makes a front too long; a flat image is not changed."""
+    k = 4 * np.pi * 100e6 / SPEED_OF_LIGHT
+    image = np.full((2, 32, 40), np.exp(1j * k * 0.5))
+    assert np.abs(halo_errors(image, HZ)).max() < 1e-9
+    image[:, :, 20:] *= 5 * np.exp(1j * k * 0.2)
+    assert (halo_errors(image, HZ)[1, :, :15] > 0).all()
+
+
+def test_unknown_method_is_named():
+    """The method's name is checked."""
+    assert method_named("joint") == "joint"
+    with pytest.raises(ConfigError, match="averaged"):
+        method_named("best")
+
+
+def test_joint_evidence_holds_covariance_and_suggestion():
+    """Evidence gains a (6, 6) covariance, eigenvalues and a next view, all JSON numbers."""
+    rng = np.random.default_rng(6)
+    found = joint_icp([made_view(i, rng, noise=5e-4) for i in range(4)], GUESS)
+    evidence = joint_evidence(found, HZ, composed((), HZ, found.range_coefficients))
+    assert np.array(evidence["covariance"]).shape == (6, 6)
+    assert len(evidence["observability"]["eigenvalues"]) == 6
+    assert evidence["observability"]["unconstrained"] == []
+    assert evidence["observability"]["suggestion"]["tilt_deg"] in (20.0, 30.0, 40.0)

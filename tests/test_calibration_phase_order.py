@@ -1,0 +1,157 @@
+"""Phase order of raw frames: every permutation, both signs and all starts are found or refused."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration import calibrate_cli
+from calibration.phase_order import PhaseOrderRefused, find_phase_order
+from tofcapture.camera import Camera
+from tofcapture.errors import DataError, FormatError
+from tofcapture.ops.phase import mean_phasors, taps
+from tofcapture.rig import SPEED_OF_LIGHT
+
+SHAPE = (60, 80)
+seeds = st.integers(0, 2**32 - 1)
+few = settings(max_examples=15, deadline=None)
+
+
+def scene(rng):
+    """Distances of a tilted wall with a box before it, and patches of albedo."""
+    camera = Camera(SHAPE[1], SHAPE[0], 70, 70, 39.5, 29.5)
+    normal = np.array([0.5, 0.2, 1]) / np.linalg.norm([0.5, 0.2, 1])
+    z = 0.9 / (camera.rays @ normal)
+    z[20:40, 30:50] = 0.5
+    albedo = rng.uniform(0.4, 0.8, (6, 8)).repeat(10, 0).repeat(10, 1)
+    return camera.depth_to_radial(z), albedo
+
+
+def made(seed, hz_of, *, bipolar=False, noise=2.0, offset=0.1):
+    """Raw frames of channels in random order, sign and start, with what they truly are."""
+    rng = np.random.default_rng(seed)
+    radial, albedo = scene(rng)
+    amplitude = 300 * albedo / radial**2
+    sign, hz, theta = rng.choice([-1, 1]), [], []
+    for f in hz_of:
+        hz += [f] * 4
+        theta += list(np.mod(sign * np.arange(4) + rng.integers(4), 4) * np.pi / 2)
+    order = rng.permutation(len(hz))
+    hz, theta = np.array(hz)[order], np.array(theta)[order]
+    phasor = np.stack(
+        [amplitude * np.exp(1j * (4 * np.pi * f * radial / SPEED_OF_LIGHT + offset)) for f in sorted(hz_of)]
+    )
+    mean = np.zeros(phasor.shape) if bipolar else np.stack([amplitude / 0.7 + 20] * len(hz_of))
+    clean = taps(phasor, mean, hz, theta)
+    return clean + rng.normal(0, noise, (3, *clean.shape)), radial, hz, theta
+
+
+def same(order, hz, theta):
+    turned = np.abs(np.angle(np.exp(1j * (np.array(order.phase_rad) - theta))))
+    return order.modulation_hz == tuple(hz) and turned.max() < 1e-9
+
+
+@pytest.mark.parametrize("hz_of", [(30e6,), (20e6, 100e6)])
+@given(seed=seeds, bipolar=st.booleans(), reference=st.booleans())
+@few
+def test_order_is_found(hz_of, seed, bipolar, reference):
+    """Any order, sign and start of unipolar or bipolar taps is found, with a reference depth and without."""
+    raw, radial, hz, theta = made(seed, hz_of, bipolar=bipolar)
+    order = find_phase_order(raw, hz_of, radial if reference else None)
+    assert same(order, hz, theta)
+    assert 0 < order.confidence <= 1
+    assert order.second_harmonic < 0.02
+    if reference:
+        np.testing.assert_allclose(order.offset_rad, 0.1, atol=0.02)
+
+
+def test_decoding_by_the_found_order_gives_the_range():
+    """Phases decoded by what was found grow with the distance as they must."""
+    raw, radial, *_ = made(1, (20e6, 100e6), offset=0.0)
+    order = find_phase_order(raw, (20e6, 100e6))
+    phase = np.angle(mean_phasors(raw, order.modulation_hz, order.phase_rad)[0])
+    np.testing.assert_allclose(phase * SPEED_OF_LIGHT / (4 * np.pi * 20e6), radial, atol=0.05)
+
+
+def test_brightness_is_not_asked_where_a_reference_is():
+    """Light that grows with distance fools brightness, not a reference depth."""
+    raw, radial, hz, theta = made(2, (20e6,))
+    raw = raw * radial**4
+    assert same(find_phase_order(raw, (20e6,), radial), hz, theta)
+    assert not same(find_phase_order(raw, (20e6,)), hz, theta)
+
+
+def flat(seed):
+    raw, *_ = made(seed, (20e6, 100e6))
+    return np.repeat(np.repeat(raw[..., 30:31, 40:41], 60, axis=-2), 80, axis=-1) + np.random.default_rng(
+        0
+    ).normal(0, 1, (3, 8, *SHAPE))
+
+
+@pytest.mark.parametrize(
+    ("raw", "says"),
+    [
+        (np.random.default_rng(0).normal(500, 20, (3, 4, *SHAPE)), "four-phase|ambiguous"),
+        (np.full((3, 4, *SHAPE), 100.0), "modulated pixels"),
+        (np.full((3, 4, *SHAPE), np.nan), "modulated pixels"),
+    ],
+)
+def test_frames_without_phases_are_refused(raw, says):
+    """Noise, constant frames and NaN are refused by name."""
+    with pytest.raises(PhaseOrderRefused, match=says):
+        find_phase_order(raw, (20e6,))
+
+
+def test_one_distance_is_ambiguous():
+    """A scene of a single distance cannot tell low from high frequency, nor sign: refused."""
+    with pytest.raises(PhaseOrderRefused, match="ambiguous"):
+        find_phase_order(flat(0), (20e6, 100e6))
+
+
+def test_foreign_reference_is_refused():
+    """A reference depth that has nothing to do with the scene does not settle the sign."""
+    raw, radial, *_ = made(4, (20e6, 100e6))
+    with pytest.raises(PhaseOrderRefused, match="sign"):
+        find_phase_order(
+            raw, (20e6, 100e6), 10 * np.random.default_rng(0).permutation(radial.ravel()).reshape(SHAPE)
+        )
+    with pytest.raises(DataError, match="shape"):
+        find_phase_order(raw, (20e6, 100e6), radial[:-1])
+
+
+@pytest.mark.parametrize("shape", [(3, 5, 6, 7), (8, 8), (3, 12, 6, 7)])
+def test_wrong_shapes_are_data_errors(shape):
+    """Channel counts that are not four per frequency are named."""
+    with pytest.raises(DataError, match="raw"):
+        find_phase_order(np.zeros(shape), (20e6, 100e6) if shape[1] != 12 else (1e6, 2e6, 3e6))
+
+
+def args(*words):
+    parser = argparse.ArgumentParser()
+    calibrate_cli.COMMAND.configure(parser)
+    return parser.parse_args([str(w) for w in words])
+
+
+def test_command_finds_and_writes(tmp_path):
+    """calibrate phase-order reads .npy, prints one line per channel and writes JSON; damaged files are named."""
+    raw, radial, hz, theta = made(5, (20e6, 100e6))
+    np.save(tmp_path / "raw.npy", raw)
+    np.save(tmp_path / "radial.npy", radial)
+    out = tmp_path / "order.json"
+    outcome = calibrate_cli.COMMAND.run(
+        args("phase-order", tmp_path / "raw.npy", "--reference", tmp_path / "radial.npy", "--out", out)
+    )
+    written = json.loads(out.read_text())
+    assert written["modulation_hz"] == hz.tolist()
+    np.testing.assert_allclose(written["phase_rad"], theta)
+    assert len(outcome.text.splitlines()) >= 10
+    (tmp_path / "bad.npy").write_text("no array")
+    with pytest.raises(FormatError):
+        calibrate_cli.COMMAND.run(args("phase-order", tmp_path / "bad.npy"))
+    with pytest.raises(DataError, match="no such file"):
+        calibrate_cli.COMMAND.run(args("phase-order", tmp_path / "none.npy"))
