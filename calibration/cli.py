@@ -24,7 +24,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recording", type=Path, metavar="RECORDING", help="folder that record --calibration filled"
     )
-    parser.add_argument("--backend", default="open3d", help="open3d (default) or kiss-icp")
+    parser.add_argument(
+        "--backend", default="open3d", help="open3d (default), kiss-icp, projective (ours) or small-gicp"
+    )
     parser.add_argument(
         "--method",
         default="averaged",

@@ -77,7 +77,7 @@ def align(
     recording
         Folder with ``views/calibration/view-*.h5``.
     backend
-        ``open3d`` or ``kiss-icp``.
+        ``open3d``, ``kiss-icp``, ``projective`` or ``small-gicp``.
     initial
         Rig to start from; by default the one the first view carries.
     progress
