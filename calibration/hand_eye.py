@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.hand_eye_checks import check_motion, check_numbers, check_pairing, clean
-from calibration.hand_eye_closed import board_of, daniilidis, distances, park_martin, residuals
+from calibration.hand_eye_closed import daniilidis, distances, park_martin
 from calibration.hand_eye_consensus import consensus
 from calibration.hand_eye_diagnosis import check_agreement, oriented, target_scale
 from calibration.hand_eye_refine import Refined, refine
@@ -189,15 +189,6 @@ def refine_from_consensus(P: Float64, B: Float64) -> Refined:
     """Solve without any gate: the consensus start, refined; for searches that solve many times."""
     start = consensus(P, B)
     return refine(P, B, start.X, start.Z, start.noise)
-
-
-def closed_form_errors(P: Float64, B: Float64, forms: dict[str, Float64]) -> dict[str, tuple[float, float]]:
-    """Median residual (metres, radians) that each closed form leaves."""
-    out = {}
-    for name, X in forms.items():
-        moved, turned = distances(residuals(P, B, X, board_of(P, B, X)))
-        out[name] = float(np.median(moved)), float(np.median(turned))
-    return out
 
 
 def to_dict(result: HandEye) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.rims import JUMP, REACH, Rims, _flat, _joined, _oriented, _outward, stereo_rims
+from calibration.rims import JUMP, REACH, Rims, facing_edge, joined, on_surface, outward, stereo_rims
 from tofcapture.camera import Camera
 from tofcapture.poses import Float64
 
@@ -41,7 +41,7 @@ def lit_rims(phasor: NDArray[np.complex128], depth: Float64, camera: Camera, ill
     """
     found = []
     for axis, sign in ((1, 1), (1, -1), (0, 1), (0, -1)):
-        z, d = _oriented(phasor, axis, sign), _oriented(depth, axis, sign)
+        z, d = facing_edge(phasor, axis, sign), facing_edge(depth, axis, sign)
         image, focal = (0, camera.fx) if axis == 1 else (1, camera.fy)
         row, front, inverse, share = _lit_steps(z, d, -sign * focal * float(illuminator[image]))
         at = front + 0.5 + share
@@ -50,8 +50,8 @@ def lit_rims(phasor: NDArray[np.complex128], depth: Float64, camera: Camera, ill
         ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(row))], -1)
         slope = (inverse[:, -1] - inverse[:, 0]) / (REACH - 1)
         reach = at - front + (REACH - 1) / 2
-        found.append((ray / (inverse.mean(axis=1) + slope * reach)[:, None], _outward(axis, sign, len(row))))
-    return _joined(found)
+        found.append((ray / (inverse.mean(axis=1) + slope * reach)[:, None], outward(axis, sign, len(row))))
+    return joined(found)
 
 
 def unveiled_rims(points: NDArray[np.floating], camera: Camera) -> Rims:
@@ -82,7 +82,7 @@ def _lit_steps(
     inverse = np.stack([1 / d[:, window[k]] for k in range(REACH)], axis=-1)
     front, back = d[:, window[REACH - 1]], d[:, window[REACH + ACROSS]]
     behind = np.abs(d[:, window[REACH + ACROSS + 1]] - back) < JUMP / 2
-    good = (back - front > JUMP) & behind & _flat(inverse, front)
+    good = (back - front > JUMP) & behind & on_surface(inverse, front)
     row, column = np.nonzero(good)
     last = column + REACH - 1
     across = np.stack([z[:, row, last + 1 + k] for k in range(ACROSS)], axis=-1)

@@ -60,7 +60,7 @@ def tof_rims(phasor: NDArray[np.complex128], depth: Float64, camera: Camera) -> 
     """
     found = []
     for axis, sign in ((1, 1), (1, -1), (0, 1), (0, -1)):
-        z, d = _oriented(phasor, axis, sign), _oriented(depth, axis, sign)
+        z, d = facing_edge(phasor, axis, sign), facing_edge(depth, axis, sign)
         row, front, inverse, w = _tof_steps(z, d)
         at = front + 0.5 + w
         along = at if sign > 0 else d.shape[-1] - 1 - at
@@ -70,8 +70,8 @@ def tof_rims(phasor: NDArray[np.complex128], depth: Float64, camera: Camera) -> 
         )
         slope = (inverse[:, -1] - inverse[:, 0]) / (REACH - 1)
         reach = at - front + (REACH - 1) / 2
-        found.append((ray / (inverse.mean(axis=1) + slope * reach)[:, None], _outward(axis, sign, len(row))))
-    return _joined(found)
+        found.append((ray / (inverse.mean(axis=1) + slope * reach)[:, None], outward(axis, sign, len(row))))
+    return joined(found)
 
 
 def rim_cloud(rims: Rims, seen_from: Float64) -> Cloud:
@@ -124,7 +124,7 @@ def _tof_steps(
     behind = np.abs(d[:, window[REACH + 4]] - back) < JUMP / 2
     clean = (w[..., 0] > 0.85) & (w[..., 2] < 0.15) & (w > -0.2).all(axis=-1) & (w < 1.2).all(axis=-1)
     strong = np.abs(contrast).max(axis=0) > 0.2 * np.abs(z_front).max(axis=0)
-    good = (back - front > JUMP) & behind & clean & strong & _flat(inverse, front)
+    good = (back - front > JUMP) & behind & clean & strong & on_surface(inverse, front)
     row, column = np.nonzero(good)
     return row, column + REACH - 1, inverse[good], np.clip(w[good], 0, 1).sum(axis=-1)
 
@@ -137,8 +137,8 @@ def stereo_rims(points: NDArray[np.floating]) -> Rims:
         P = P[:, ::sign]
         row, last = _stereo_steps(P[..., 2].astype(np.float64))
         edge, inner = P[row, last].astype(np.float64), P[row, last - REACH + 1].astype(np.float64)
-        found.append((edge + (edge - inner) / (2 * (REACH - 1)), _outward(axis, sign, len(row))))
-    return _joined(found)
+        found.append((edge + (edge - inner) / (2 * (REACH - 1)), outward(axis, sign, len(row))))
+    return joined(found)
 
 
 def _stereo_steps(d: Float64) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -150,7 +150,7 @@ def _stereo_steps(d: Float64) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     front = d[row, last]
     inverse = 1 / np.stack([d[row, last - k] for k in range(REACH - 1, -1, -1)], axis=-1)
     gone = np.stack([~(d[row, last + k] - front < JUMP) for k in (2, 3)]).all(axis=0)
-    good = gone & (_next_valid(d, row, last + 1) - front > JUMP) & _flat(inverse, front)
+    good = gone & (_next_valid(d, row, last + 1) - front > JUMP) & on_surface(inverse, front)
     return row[good], last[good]
 
 
@@ -163,22 +163,26 @@ def _next_valid(d: Float64, row: NDArray[np.intp], column: NDArray[np.intp]) -> 
     return out
 
 
-def _flat(inverse: Float64, front: Float64) -> NDArray[np.bool_]:
+def on_surface(inverse: Float64, front: Float64) -> NDArray[np.bool_]:
+    """Tell which runs of inverse depth (N, REACH) before an edge are one smooth, not too steep surface; ``front`` (N,) is their depth."""
     bend = np.abs(np.diff(inverse, n=2, axis=-1)).max(axis=-1) * np.square(front)
     steep = np.abs(inverse[..., -1] - inverse[..., 0]) * np.square(front)
     return np.asarray((bend < FLAT) & (steep < JUMP / 2))
 
 
-def _oriented(image: NDArray[Any], axis: int, sign: int) -> NDArray[Any]:
+def facing_edge(image: NDArray[Any], axis: int, sign: int) -> NDArray[Any]:
+    """View of an image (..., H, W) whose last axis runs along ``axis`` in the direction of ``sign``."""
     turned = image if axis == 1 else image.swapaxes(-1, -2)
     return turned[..., ::sign]
 
 
-def _outward(axis: int, sign: int, count: int) -> Float64:
+def outward(axis: int, sign: int, count: int) -> Float64:
+    """(count, 3) unit vectors along an image axis (0 down, 1 right), camera frame."""
     out = np.zeros((count, 3))
     out[:, 0 if axis == 1 else 1] = sign
     return out
 
 
-def _joined(parts: list[tuple[Float64, Float64]]) -> Rims:
+def joined(parts: list[tuple[Float64, Float64]]) -> Rims:
+    """One set of rims from parts (points, outward directions)."""
     return Rims(np.concatenate([p for p, _ in parts]), np.concatenate([o for _, o in parts]))

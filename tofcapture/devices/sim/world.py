@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -351,12 +351,3 @@ def shared_world(context: StationContext) -> SimWorld:
         context.shared["sim"] = SimWorld(read_constants(table, "station file"), seed, scenes)
     world: SimWorld = context.shared["sim"]
     return world
-
-
-def constant_names() -> dict[str, tuple[str, ...]]:
-    """Names of the constants of each dataclass, for the test that constants.toml and the code agree."""
-    return {
-        "sensor": tuple(f.name for f in fields(Sensor)),
-        "stereo_model": tuple(f.name for f in fields(StereoModel)),
-        "render": tuple(f.name for f in fields(Render)),
-    }
