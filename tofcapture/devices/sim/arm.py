@@ -71,7 +71,7 @@ class SimArm:
         self._joints: Float64 | None = None
 
     def __enter__(self) -> Self:
-        self.move_to(HOME)
+        self._go(HOME)
         return self
 
     def __exit__(
@@ -87,9 +87,10 @@ class SimArm:
         """Report the commanded joints; the repeatability error is what no arm can know of itself."""
         if self._joints is None:
             raise DeviceError("the simulated arm is not open", hint="use the station as a context manager")
-        return ArmState(
-            self._joints.copy(), forward(self._model, self._joints), shared_clock(self._context)()
-        )
+        from tofcapture.devices.sim.world import shared_world
+
+        T_base_flange = forward(self._model, self._joints) @ shared_world(self._context).faults.offset
+        return ArmState(self._joints.copy(), T_base_flange, shared_clock(self._context)())
 
     def move_to(self, joints: Float64) -> ArmState:
         """Move along the joints at the model's speed, settle, and report; takes no time of ours.
@@ -102,6 +103,13 @@ class SimArm:
         from tofcapture.devices.sim.world import shared_world
 
         goal = _joints(joints, self._model.limit)
+        shared_world(self._context).faults.before_move()
+        self._go(goal)
+        return self.state()
+
+    def _go(self, goal: Float64) -> None:
+        from tofcapture.devices.sim.world import shared_world
+
         world = shared_world(self._context)
         key = np.round(goal, 9).tobytes()
         error = _generator(world.seed, key).standard_normal(6) * REPEATABILITY
@@ -109,7 +117,6 @@ class SimArm:
         travel = float(np.abs(goal - HOME).max()) / self._model.speed
         shared_clock(self._context).arrive(travel + _SETTLE)
         self._joints = goal
-        return self.state()
 
     def stop(self) -> None:
         """Do nothing: a simulated move is over when it returns."""

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
+
+from tofcapture.errors import ConfigError
 from tofcapture.frames import StereoFrame, StereoInfo, TofBurst, TofInfo, Truth
 
 if TYPE_CHECKING:
@@ -27,9 +32,20 @@ class _InWorld:
         return shared_world(self._context)
 
     @property
+    def _here(self) -> SimWorld:
+        """The world at the arm's pose: an arm that is not simulated is asked for it, the simulated one has said it."""
+        arm = self._context.shared.get("arm")
+        if arm is not None and not getattr(arm, "simulated", False):
+            state = arm.state()
+            self._world.set_pose(state.T_base_flange, state.joints.round(5).tobytes())
+        return self._world
+
+    @property
     def _clock(self) -> Callable[[], int]:
         from tofcapture.devices.sim.arm import shared_clock
 
+        if not getattr(self._context.shared.get("arm"), "simulated", True):
+            return time.monotonic_ns
         return shared_clock(self._context)
 
     def __enter__(self) -> Self:
@@ -51,7 +67,10 @@ class SimTof(_InWorld):
 
     def capture(self, frames: int) -> TofBurst:
         """Take a burst at the arm's present pose."""
-        return self._world.tof(frames, self._clock)
+        if frames < 1:
+            raise ConfigError(f"burst: expected at least 1 frame, got {frames}")
+        self._world.faults.before_burst()
+        return self._here.tof(frames, self._clock)
 
 
 class SimStereo(_InWorld):
@@ -63,7 +82,9 @@ class SimStereo(_InWorld):
 
     def capture(self) -> StereoFrame:
         """Take one point map at the arm's present pose."""
-        return self._world.stereo(self._clock)
+        empty = self._world.faults.before_points()
+        frame = self._here.stereo(self._clock)
+        return replace(frame, points=np.full_like(frame.points, np.nan)) if empty else frame
 
 
 class SimOperator(_InWorld):
@@ -75,7 +96,7 @@ class SimOperator(_InWorld):
 
     def truth(self) -> Truth | None:
         """Return what is exactly true of the present view."""
-        return self._world.truth()
+        return self._here.truth()
 
 
 def _arm(table: Mapping[str, Any], context: StationContext) -> object:

@@ -1,22 +1,25 @@
 """What light reaches each pixel of the ToF camera: phasors of direct and indirect light, before any electronics.
 
 A pixel is an area: sub-pixel samples are added as phasors, so that a pixel on an edge mixes foreground and background
-(a flying pixel) as a real one does.
+(a flying pixel) as a real one does. Pixels on one smooth, evenly lit surface need fewer samples than those on an edge.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.devices.sim.render import Caster, Float32
-from tofcapture.devices.sim.transport import Complex64, Lamp, Transport, direct, wavenumbers
+from tofcapture.devices.sim.render import Caster, Float32, unit_rays
+from tofcapture.devices.sim.transport import Complex64, Lamp, Transport, direct, turn, wavenumbers
 from tofcapture.poses import Float64, invert, rotate_vectors
 
+_STRAIGHT = 0.98  # cosine of the largest bend between neighbouring samples of one smooth surface
+_FLAT = 1e-3  # how far a sample may lie off its neighbour's tangent plane, as a share of the distance
 _TILE = 4  # interleaved sampling: 4 x 4 neighbouring pixels use 16 different sets of directions
 
 
@@ -45,9 +48,12 @@ class _Samples:
     found: NDArray[np.bool_]
 
 
-def _look(caster: Caster, camera: Camera, T_world_camera: Float64) -> _Samples:
-    rays = camera.rays.reshape(-1, 3) / camera.ray_lengths.reshape(-1, 1)
-    directions = rotate_vectors(T_world_camera, rays).astype(np.float32)
+def _look(
+    caster: Caster, camera: Camera, T_world_camera: Float64, pixels: NDArray[np.int64] | None = None
+) -> _Samples:
+    """What the rays of all pixels meet, or of those with the given flat indices."""
+    directions = unit_rays(camera, T_world_camera)
+    directions = directions if pixels is None else directions[pixels]
     eye = T_world_camera[:3, 3].astype(np.float32)
     hits = caster.cast(eye, directions)
     found = hits.found
@@ -125,20 +131,96 @@ def light_at_pixels(
         Rays of the last indirect bounce, per pixel.
     """
     k = wavenumbers(hz)
-    fine = _look(caster, camera.scaled(subpixels), T_world_tof)
-    seen = np.flatnonzero(fine.found)
-    irradiance = np.zeros((len(k), len(fine.points)), dtype=np.complex64)
-    irradiance[:, seen] = direct(caster, fine.points[seen], fine.normals[seen], lamp, k)
-    if transport is not None:
-        coarse = _look(caster, camera, T_world_tof)
-        indirect = _indirect(coarse, camera, lamp, transport, rays)
-        irradiance += _spread(indirect, coarse, fine, camera, subpixels)
-    total = np.empty((len(k), *camera.shape), dtype=np.complex128)
-    for c, kk in enumerate(k):
-        arriving = irradiance[c] * fine.albedo * np.exp(1j * kk * fine.distance.astype(np.float64))
-        blocks = arriving.reshape(camera.height, subpixels, camera.width, subpixels)
-        total[c] = blocks.mean(axis=(1, 3))
+    eye = _Eye(caster, camera, T_world_tof, lamp, k)
+    coarse = _look(caster, camera, T_world_tof)
+    indirect = None if transport is None else _indirect(coarse, camera, lamp, transport, rays)
+    # A pixel on one smooth surface is sampled half as finely: what it averages over changes linearly across it.
+    first = subpixels // 2 if subpixels % 2 == 0 else subpixels
+    samples, direct_light = eye.look(first, np.arange(coarse.found.size))
+    total = _means(samples, direct_light, indirect, coarse, camera, np.arange(coarse.found.size), k)
+    if first < subpixels:
+        odd = np.flatnonzero(_broken(samples, direct_light[0].real > 0, camera, first))
+        samples, direct_light = eye.look(subpixels, odd)
+        total[:, odd] = _means(samples, direct_light, indirect, coarse, camera, odd, k)
+    total = total.reshape(len(k), *camera.shape)
     return Light(phasor=total[1:], steady=total[0].real)
+
+
+@dataclass(frozen=True)
+class _Eye:
+    """A camera and a lamp in a scene."""
+
+    caster: Caster
+    camera: Camera
+    T_world_camera: Float64
+    lamp: Lamp
+    k: tuple[float, ...]
+
+    def look(self, subpixels: int, pixels: NDArray[np.int64]) -> tuple[_Samples, Complex64]:
+        """Samples of the given pixels, pixel by pixel, and the direct irradiance (len(k), N) there."""
+        own = None if subpixels == 1 else _within(self.camera, subpixels, pixels)
+        samples = _look(self.caster, self.camera.scaled(subpixels), self.T_world_camera, own)
+        seen = np.flatnonzero(samples.found)
+        out = np.zeros((len(self.k), len(samples.points)), dtype=np.complex64)
+        out[:, seen] = direct(self.caster, samples.points[seen], samples.normals[seen], self.lamp, self.k)
+        return samples, out
+
+
+def _within(camera: Camera, subpixels: int, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Flat indices, in the image ``subpixels`` times as fine, of the samples of each pixel, one pixel after the other."""
+    v, u = pixels // camera.width, pixels % camera.width
+    step = np.arange(subpixels)
+    rows = (v[:, None] * subpixels + step)[:, :, None] * (camera.width * subpixels)
+    out: NDArray[np.int64] = rows + (u[:, None] * subpixels + step)[:, None, :]
+    return out.reshape(-1)
+
+
+def _means(
+    samples: _Samples,
+    irradiance: Complex64,
+    indirect: Complex64 | None,
+    coarse: _Samples,
+    camera: Camera,
+    pixels: NDArray[np.int64],
+    k: Sequence[float],
+) -> NDArray[np.complex128]:
+    """(len(k), P) mean over each pixel's samples of albedo times irradiance, turned by the way back to the camera."""
+    if not len(pixels):
+        return np.zeros((len(k), 0), dtype=np.complex128)
+    own = np.repeat(pixels, len(samples.points) // len(pixels))
+    if indirect is not None:
+        irradiance = irradiance + indirect[:, _nearest(coarse, samples, own, camera)]
+    out = np.empty((len(k), len(pixels)), dtype=np.complex128)
+    for c, kk in enumerate(k):
+        phase = (kk * samples.distance.astype(np.float64)) % (2 * np.pi)
+        arriving = irradiance[c] * samples.albedo * turn(phase.astype(np.float32))
+        out[c] = arriving.reshape(len(pixels), -1).mean(axis=1, dtype=np.complex128)
+    return out
+
+
+def _broken(samples: _Samples, lit: NDArray[np.bool_], camera: Camera, subpixels: int) -> NDArray[np.bool_]:
+    """(H * W,) pixels with a sample beside another surface, another albedo or the edge of a shadow."""
+    (H, W), s = camera.shape, subpixels
+
+    def image(values: NDArray[Any]) -> NDArray[Any]:
+        tail = values.shape[1:]
+        return values.reshape(H, W, s, s, *tail).swapaxes(1, 2).reshape(H * s, W * s, *tail)
+
+    points, normals, albedo = image(samples.points), image(samples.normals), image(samples.albedo)
+    state = image(samples.found + 2 * lit.astype(np.int8))
+    distance = image(samples.distance)
+    odd = np.zeros((H * s, W * s), dtype=bool)
+    for a, b in (
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+        ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
+    ):
+        gap = np.abs(np.einsum("ijk,ijk->ij", points[a] - points[b], normals[b]))
+        bend = np.einsum("ijk,ijk->ij", normals[a], normals[b])
+        differs = (state[a] != state[b]) | (albedo[a] != albedo[b])
+        differs |= (state[a] > 0) & ((bend < _STRAIGHT) | (gap > _FLAT * distance[b]))
+        odd[a] |= differs
+        odd[b] |= differs
+    return odd.reshape(H, s, W, s).any(axis=(1, 3)).reshape(-1)
 
 
 def _indirect(coarse: _Samples, camera: Camera, lamp: Lamp, transport: Transport, rays: int) -> Complex64:
@@ -180,17 +262,13 @@ def _filter(h: Complex64, samples: _Samples, camera: Camera) -> Complex64:
     return mean.astype(np.complex64).reshape(h.shape)
 
 
-def _spread(
-    indirect: Complex64, coarse: _Samples, fine: _Samples, camera: Camera, subpixels: int
-) -> Complex64:
-    """Give every sub-pixel sample the indirect light of the nearest pixel centre on its own surface."""
+def _nearest(coarse: _Samples, fine: _Samples, own: NDArray[np.int64], camera: Camera) -> NDArray[np.int64]:
+    """Flat index of the nearest pixel centre that lies on the surface of each sample; ``own`` is the sample's pixel."""
     H, W = camera.shape
-    row = np.repeat(np.arange(H), subpixels)[:, None]
-    column = np.repeat(np.arange(W), subpixels)[None, :]
-    own = (row * W + column).reshape(-1)
     choice = own.copy()
-    odd = np.flatnonzero(fine.found & (_unlike(fine, np.arange(len(own)), coarse, own) > 0.02))
-    best = _unlike(fine, odd, coarse, own[odd])
+    cost = _unlike(fine, np.arange(len(own)), coarse, own)
+    odd = np.flatnonzero(fine.found & (cost > 0.02))
+    best = cost[odd]
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
             y = np.clip(own[odd] // W + dy, 0, H - 1)
@@ -199,7 +277,7 @@ def _spread(
             cost = _unlike(fine, odd, coarse, other)
             better = cost < best
             choice[odd[better]], best[better] = other[better], cost[better]
-    return indirect[:, choice]
+    return choice
 
 
 def _unlike(fine: _Samples, i: NDArray[np.int64], coarse: _Samples, j: NDArray[np.int64]) -> Float32:

@@ -6,16 +6,20 @@ same triangles.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.camera import Camera
 from tofcapture.devices.sim.scene import SceneObject
 from tofcapture.errors import ConfigError
 from tofcapture.o3d import load_open3d
+from tofcapture.poses import Float64
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
@@ -103,14 +107,43 @@ class Hits:
         return out
 
 
+@lru_cache(maxsize=8)
+def _unit_rays(camera: Camera) -> Float32:
+    """(3, H * W) unit rays through the pixel centres, one plane per coordinate."""
+    rays = (camera.rays / camera.ray_lengths[..., None]).reshape(-1, 3)
+    out: Float32 = np.ascontiguousarray(rays.T, dtype=np.float32)
+    out.flags.writeable = False
+    return out
+
+
+def unit_rays(camera: Camera, T_world_camera: Float64, part: slice = slice(None)) -> Float32:
+    """(N, 3) float32 unit rays through the pixel centres, world frame; ``part`` of the flat image only.
+
+    Not a matrix product: BLAS may round differently with another number of threads.
+    """
+    x, y, z = _unit_rays(camera)[:, part]
+    out = np.empty((len(x), 3), dtype=np.float32)
+    for i, (a, b, c) in enumerate(T_world_camera[:3, :3].astype(np.float32)):
+        np.multiply(x, a, out=out[:, i])
+        out[:, i] += b * y
+        out[:, i] += c * z
+    return out
+
+
+def _threads() -> int:
+    wanted = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
+    return int(wanted) if wanted.isdigit() else 0
+
+
 class Caster:
-    """A scene ready for rays."""
+    """A scene ready for rays; uses as many threads as ``OMP_NUM_THREADS`` says, or all."""
 
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
+        self._threads = _threads()
         o3d = load_open3d()
         self._tensor: Any = o3d.core.Tensor
-        self._scene: Any = o3d.t.geometry.RaycastingScene()
+        self._scene: Any = o3d.t.geometry.RaycastingScene(nthreads=self._threads)
         vertices = geometry.corners.reshape(-1, 3).astype(np.float32)
         triangles = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
         self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
@@ -128,7 +161,7 @@ class Caster:
         rays = np.empty((len(directions), 6), dtype=np.float32)
         rays[:, :3] = origins
         rays[:, 3:] = directions
-        answer = self._scene.cast_rays(self._tensor(rays))
+        answer = self._scene.cast_rays(self._tensor(rays), nthreads=self._threads)
         triangle = answer["primitive_ids"].numpy().astype(np.int64)
         distance = answer["t_hit"].numpy()
         triangle[~np.isfinite(distance)] = -1
@@ -143,7 +176,7 @@ class Caster:
         rays[:, :3] = origins
         rays[:, 3:] = np.asarray(target, dtype=np.float32) - origins
         out: NDArray[np.bool_] = self._scene.test_occlusions(
-            self._tensor(rays), tnear=0.0, tfar=1.0 - 1e-5
+            self._tensor(rays), tnear=0.0, tfar=1.0 - 1e-5, nthreads=self._threads
         ).numpy()
         return out
 

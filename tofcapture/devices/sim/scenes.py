@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +33,7 @@ _FLOOR = -1.2  # m, z in the base frame
 _REACH = 0.33  # m; targets stay within this disc about the table's centre
 
 
-def _on_table(x: float, y: float) -> Float64:
+def on_table(x: float, y: float) -> Float64:
     """(3,) point of the table top, from its centre, metres."""
     out: Float64 = TABLE_CENTRE + [x, y, 0.0]  # noqa: RUF005  an addition of numbers
     return out
@@ -68,13 +68,13 @@ def scene_objects(
         Objects (``target=True``), then table, pedestal, walls and clutter.
     """
     if name == CALIBRATION:
-        return [*_calibration(), *_surroundings(name, seed, clutter=False)]
+        return [*_calibration(), *surroundings(name, seed, clutter=False)]
     rng = generator(name, seed, "objects")
     if meshes and name in meshes:
-        items = [(name, _read(meshes[name], mesh_unit))]
+        items = [(name, read_table_mesh(meshes[name], mesh_unit))]
     else:
         items = [(family, FAMILIES[family](rng)) for family in _families(name, rng)]
-    return [*_arranged(items, rng), *_surroundings(name, seed, clutter=True)]
+    return [*arranged(items, rng), *surroundings(name, seed, clutter=True)]
 
 
 def _families(name: str, rng: np.random.Generator) -> list[str]:
@@ -87,7 +87,7 @@ def _families(name: str, rng: np.random.Generator) -> list[str]:
     return [choice[int(i)] for i in rng.choice(len(choice), size=count, replace=False)]
 
 
-def _read(path: Path, unit: str) -> Mesh:
+def read_table_mesh(path: Path, unit: str) -> Mesh:
     """Read a mesh file, resting on z = 0; its size tells whether the unit can be right."""
     mesh = settle(read_mesh(path, unit))
     size = float(np.ptp(mesh[0], axis=0).max())
@@ -98,8 +98,16 @@ def _read(path: Path, unit: str) -> Mesh:
     return mesh
 
 
-def _arranged(items: Sequence[tuple[str, Mesh]], rng: np.random.Generator) -> list[SceneObject]:
-    """Stand objects on the table, turned at random, side by side."""
+def _any_albedo(rng: np.random.Generator) -> float:
+    return float(rng.uniform(0.15, 0.9))
+
+
+def arranged(
+    items: Sequence[tuple[str, Mesh]],
+    rng: np.random.Generator,
+    albedo: Callable[[np.random.Generator], float] = _any_albedo,
+) -> list[SceneObject]:
+    """Stand objects on the table, turned at random, side by side; ``albedo`` draws that of each."""
     out: list[SceneObject] = []
     discs: list[tuple[Float64, float]] = []
     for name, (vertices, triangles) in items:
@@ -108,8 +116,8 @@ def _arranged(items: Sequence[tuple[str, Mesh]], rng: np.random.Generator) -> li
         if place is None:
             continue
         discs.append((place, radius))
-        T = transform(rotation_exp([0, 0, rng.uniform(-np.pi, np.pi)]), _on_table(*place))
-        out.append(SceneObject(vertices, triangles, float(rng.uniform(0.15, 0.9)), T, target=True, name=name))
+        T = transform(rotation_exp([0, 0, rng.uniform(-np.pi, np.pi)]), on_table(*place))
+        out.append(SceneObject(vertices, triangles, albedo(rng), T, target=True, name=name))
     return out
 
 
@@ -128,7 +136,7 @@ def _free_place(
     return None
 
 
-def _solid(
+def solid(
     name: str, mesh: Mesh, albedo: float, at: ArrayLike, turn: ArrayLike = (0, 0, 0), *, target: bool = False
 ) -> SceneObject:
     """Stand a mesh somewhere; ``turn`` is a rotation vector."""
@@ -151,42 +159,42 @@ def _calibration() -> list[SceneObject]:
         transform(rotation_exp([np.pi / 2, 0, 0]), [0, 0, 0]),
     )
     return [
-        _solid("board", plate, 0.7, BOARD_CENTRE, (0, BOARD_TILT, 0), target=True),
+        solid("board", plate, 0.7, BOARD_CENTRE, (0, BOARD_TILT, 0), target=True),
         *(_leg(x, y) for x, y in ((-0.06, 0.04), (0.12, 0.05), (-0.03, -0.16))),
-        _solid("ball", ball(0.085), 0.6, _on_table(0.06, 0.36), target=True),
-        _solid("block", settle(block), 0.45, _on_table(-0.13, 0.40), (0, 0, 0.5), target=True),
-        _solid("pyramid", settle(pyramid), 0.65, _on_table(-0.10, -0.38), (0, 0, 0.3), target=True),
-        _solid("ridge", settle(ridge), 0.5, _on_table(0.15, -0.38), (0, 0, 0.8), target=True),
-        _solid("peg", extrude(circle(0.05, segments=48), 0.12), 0.55, _on_table(0.36, 0.02), target=True),
+        solid("ball", ball(0.085), 0.6, on_table(0.06, 0.36), target=True),
+        solid("block", settle(block), 0.45, on_table(-0.13, 0.40), (0, 0, 0.5), target=True),
+        solid("pyramid", settle(pyramid), 0.65, on_table(-0.10, -0.38), (0, 0, 0.3), target=True),
+        solid("ridge", settle(ridge), 0.5, on_table(0.15, -0.38), (0, 0, 0.8), target=True),
+        solid("peg", extrude(circle(0.05, segments=48), 0.12), 0.55, on_table(0.36, 0.02), target=True),
     ]  # fmt: skip
 
 
 def _leg(x: float, y: float) -> SceneObject:
     """Round leg under the board's point (x, y), between cut-outs; ends 3 mm below the plate."""
-    foot = _on_table(x * np.cos(BOARD_TILT), y)
+    foot = on_table(x * np.cos(BOARD_TILT), y)
     height = BOARD_CENTRE[2] - TABLE_CENTRE[2] - x * np.sin(BOARD_TILT) - 0.005 - 0.003 - 0.004
-    return _solid("leg", extrude(circle(0.012, segments=24), height), 0.5, foot)
+    return solid("leg", extrude(circle(0.012, segments=24), height), 0.5, foot)
 
 
-def _surroundings(name: str, seed: int, *, clutter: bool) -> list[SceneObject]:
+def surroundings(name: str, seed: int, *, clutter: bool) -> list[SceneObject]:
     """Table, pedestal, floor, walls and boxes; where and how bright differs from scene to scene."""
     rng = generator(name, seed, "surroundings")
     x, y, z = TABLE_CENTRE
     out = [
-        _solid("table", cuboid(*_TABLE), rng.uniform(0.2, 0.75), [x + 0.08, y, z - _TABLE[2]]),
-        _solid("pedestal", cuboid(0.2, 0.2, -_FLOOR - 0.02), 0.4, [0, 0, _FLOOR]),
-        _solid("floor", cuboid(6, 6, 0.1), rng.uniform(0.15, 0.6), [x, y, _FLOOR - 0.1]),
+        solid("table", cuboid(*_TABLE), rng.uniform(0.2, 0.75), [x + 0.08, y, z - _TABLE[2]]),
+        solid("pedestal", cuboid(0.2, 0.2, -_FLOOR - 0.02), 0.4, [0, 0, _FLOOR]),
+        solid("floor", cuboid(6, 6, 0.1), rng.uniform(0.15, 0.6), [x, y, _FLOOR - 0.1]),
     ]
     if not clutter or rng.random() < 0.85:
         out.append(
-            _solid(
+            solid(
                 "back wall", cuboid(0.1, 6, 3.2), rng.uniform(0.3, 0.85), [rng.uniform(1.9, 3.0), 0, _FLOOR]
             )
         )
     for side in (-1, 1):
         if rng.random() < 0.5:
             far = side * rng.uniform(1.4, 2.6)
-            out.append(_solid("side wall", cuboid(6, 0.1, 3.2), rng.uniform(0.3, 0.85), [x, far, _FLOOR]))
+            out.append(solid("side wall", cuboid(6, 0.1, 3.2), rng.uniform(0.3, 0.85), [x, far, _FLOOR]))
     if clutter:
         out += [_clutter(rng) for _ in range(int(rng.integers(0, 6)))]
     return out
@@ -198,8 +206,8 @@ def _clutter(rng: np.random.Generator) -> SceneObject:
     turn = (0.0, 0.0, rng.uniform(-np.pi, np.pi))
     if rng.random() < 0.5:
         size = rng.uniform([0.06, 0.06, 0.04], [0.2, 0.2, 0.12])
-        place = _on_table(rng.uniform(-0.2, 0.5), side * rng.uniform(0.55, 0.68))
+        place = on_table(rng.uniform(-0.2, 0.5), side * rng.uniform(0.55, 0.68))
     else:
         size = rng.uniform([0.2, 0.2, 0.3], [0.5, 0.5, 1.0])
         place = np.array([rng.uniform(0.3, 1.6), side * rng.uniform(1.15, 1.3), _FLOOR])
-    return _solid("clutter", cuboid(*size), rng.uniform(0.15, 0.9), place, turn)
+    return solid("clutter", cuboid(*size), rng.uniform(0.15, 0.9), place, turn)

@@ -6,6 +6,7 @@ Every effect has its own switch; :func:`ideal` turns all of them off.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,9 @@ from tofcapture.devices.sim.light import Light
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Complex128, frequencies, radius_px
 from tofcapture.poses import Float64
-from tofcapture.rig import RangeError
+from tofcapture.rig import SPEED_OF_LIGHT, RangeError, image_places
+
+_FEW = 200.0  # electrons; below, shot noise is drawn from the Poisson distribution itself
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,20 @@ def ideal(sensor: Sensor) -> Sensor:
     )
 
 
+@lru_cache(maxsize=4)
+def _halo_spectrum(H: int, W: int, radius: float) -> tuple[Complex128, tuple[int, int]]:
+    """Spectrum of the halo and the size of the transform.
+
+    Only the image itself is kept of the convolution, so a period of ``2 H - 1`` is enough: what wraps around falls outside.
+    """
+    from scipy.fft import next_fast_len, rfft2
+
+    v, u = np.mgrid[-H + 1 : H, -W + 1 : W]
+    halo = 1 / (1 + (np.hypot(u, v) / (radius * W)) ** 2) ** 1.5
+    shape = (next_fast_len(2 * H - 1), next_fast_len(2 * W - 1, real=True))
+    return rfft2(halo / halo.sum(), shape), shape
+
+
 def scatter(image: NDArray[Any], share: float, radius: float) -> NDArray[Any]:
     """Lens scattering: ``z + share (z * h)`` with a broad Lorentzian halo h of unit sum (method.md 4.4).
 
@@ -103,13 +120,14 @@ def scatter(image: NDArray[Any], share: float, radius: float) -> NDArray[Any]:
     """
     if share == 0:
         return image
+    if np.iscomplexobj(image):
+        return scatter(image.real, share, radius) + 1j * scatter(image.imag, share, radius)
+    from scipy.fft import irfft2, rfft2
+
     H, W = image.shape[-2:]
-    v, u = np.mgrid[-H + 1 : H, -W + 1 : W]
-    halo = 1 / (1 + (np.hypot(u, v) / (radius * W)) ** 2) ** 1.5
-    shape = (3 * H - 2, 3 * W - 2)
-    spectrum = np.fft.fft2(halo / halo.sum(), shape)
-    spread = np.fft.ifft2(np.fft.fft2(image, shape) * spectrum)[..., H - 1 : 2 * H - 1, W - 1 : 2 * W - 1]
-    out: NDArray[Any] = image + share * (spread if np.iscomplexobj(image) else spread.real)
+    spectrum, shape = _halo_spectrum(H, W, radius)
+    spread = irfft2(rfft2(image, shape) * spectrum, shape)[..., H - 1 : 2 * H - 1, W - 1 : 2 * W - 1]
+    out: NDArray[Any] = image + share * spread
     return out
 
 
@@ -146,36 +164,62 @@ def expose(
     steady = scatter(light.steady, sensor.scattering, sensor.scattering_radius) * gain
     phasor = phasor * np.asarray(sensor.contrast)[:, None, None]
     fixed = np.random.default_rng([serial, 1]).standard_normal(info.camera.shape) * sensor.pixel_offset
-    taps = np.stack([_taps(phasor, steady + sensor.ambient, sensor, info, fixed, float(t)) for t in celsius])
-    electrons = taps * sensor.electrons_per_unit
-    if sensor.shot_noise:
-        electrons = rng.poisson(np.maximum(electrons, 0)).astype(np.float64)
-    if sensor.read_noise:
-        electrons = electrons + sensor.read_noise * rng.standard_normal(electrons.shape)
-    raw = electrons / sensor.electrons_per_unit
+    taps: NDArray[Any] = _taps(phasor, steady + sensor.ambient, sensor, info, fixed, celsius)
+    if sensor.shot_noise or sensor.read_noise:
+        taps = _noisy(taps, sensor, rng)
     if sensor.quantise:
-        return np.clip(np.rint(raw), 0, sensor.full_scale).astype(np.uint16), celsius
-    return raw, celsius
+        return np.clip(np.rint(taps), 0, sensor.full_scale).astype(np.uint16), celsius
+    return taps.astype(np.float64, copy=False), celsius
+
+
+def _noisy(taps: Float64, sensor: Sensor, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Taps with shot and read noise, from one draw of normal numbers.
+
+    The sum of a Poisson number of mean L and read noise of variance s^2 has mean L, variance V = L + s^2 and third
+    cumulant L. The normal number z is bent to have all three (Cornish and Fisher): ``L + sqrt(V) z + L / (6 V) (z^2 - 1)``.
+    Where few electrons arrive, the Poisson number itself is drawn.
+    """
+    mean = np.maximum(taps * sensor.electrons_per_unit, 0).astype(np.float32)
+    shot = mean if sensor.shot_noise else np.zeros((), np.float32)
+    z = rng.standard_normal(mean.shape, dtype=np.float32)
+    variance = shot + np.float32(sensor.read_noise**2)
+    out = mean + np.sqrt(variance) * z
+    if sensor.shot_noise:
+        out += shot / (6 * np.maximum(variance, np.float32(1e-6))) * (z * z - 1)
+        few = np.nonzero(mean < _FEW)
+        out[few] = rng.poisson(mean[few]) + np.float32(sensor.read_noise) * z[few]
+    raw: NDArray[np.float32] = out / np.float32(sensor.electrons_per_unit)
+    return raw
 
 
 def _taps(
-    phasor: Complex128, mean: Float64, sensor: Sensor, info: TofInfo, fixed: Float64, celsius: float
+    phasor: Complex128, mean: Float64, sensor: Sensor, info: TofInfo, fixed: Float64, celsius: Float64
 ) -> Float64:
-    """Noise-free taps (K, H, W) of one frame."""
+    """Noise-free taps (frames, K, H, W) of a burst.
+
+    Temperature turns all phases of a frequency by one angle a frame, so cosines are taken once a burst.
+    """
     hz = frequencies(info.modulation_hz)
     amplitude, phase = np.abs(phasor), np.mod(np.angle(phasor), 2 * np.pi)
-    radius = radius_px(info.camera)
+    radius, place = radius_px(info.camera), image_places(info.camera)
     by_hz = {e.modulation_hz: e for e in sensor.range_errors}
-    late = []
+    out = np.empty((len(celsius), len(info.modulation_hz), *mean.shape))
     for i, f in enumerate(hz):
-        error = fixed + (by_hz[f].at(phase[i], radius, celsius) if f in by_hz else 0.0)
-        late.append(phase[i] + 4 * np.pi * f / 299_792_458.0 * error)
-    out = []
-    for f, theta in zip(info.modulation_hz, info.phase_rad, strict=True):
-        i = hz.index(f)
-        x = late[i] + theta
-        wave = np.cos(x)
-        for m, a in sensor.harmonics:
-            wave = wave + a * np.cos(m * x)
-        out.append(mean + amplitude[i] * wave)
-    return np.stack(out)
+        error = by_hz.get(f, RangeError(f))
+        turn = 4 * np.pi * f / SPEED_OF_LIGHT
+        wrong = error.at(phase[i], radius, error.reference_celsius, place, amplitude[i])
+        late = phase[i] + turn * (fixed + wrong)
+        warm = turn * error.per_kelvin * (celsius - error.reference_celsius)
+        for k in np.flatnonzero(np.asarray(info.modulation_hz) == f):
+            x = late + info.phase_rad[k]
+            out[:, k] = mean + amplitude[i] * _wave(x, warm, sensor.harmonics)
+    return out
+
+
+def _wave(x: Float64, warm: Float64, harmonics: tuple[tuple[int, float], ...]) -> Float64:
+    """(frames, H, W) correlation waveform at ``x (H, W) + warm (frames,)``."""
+    total = np.zeros((len(warm), *x.shape))
+    for m, a in ((1, 1.0), *harmonics):
+        cosine, sine = a * np.cos(m * x), a * np.sin(m * x)
+        total += np.cos(m * warm)[:, None, None] * cosine - np.sin(m * warm)[:, None, None] * sine
+    return total

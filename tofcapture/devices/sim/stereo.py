@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.devices.sim.render import Caster, lift
-from tofcapture.poses import Float64, rotate_vectors, transform_points
+from tofcapture.devices.sim.render import Caster, lift, unit_rays
+from tofcapture.poses import Float64, transform_points
 
 Float32 = NDArray[np.float32]
+
+_CHUNK = 65_536  # pixels at a time: what they need stays in the cache
 
 
 @dataclass(frozen=True)
@@ -73,48 +75,65 @@ def point_map(
     -------
     (H, W, 3) float32, stereo frame, metres; NaN where nothing was measured.
     """
-    lengths = camera.ray_lengths.reshape(-1)
-    directions = rotate_vectors(T_world_stereo, camera.rays.reshape(-1, 3) / lengths[:, None]).astype(
-        np.float32
-    )
+    depth = np.full(camera.width * camera.height, np.nan, dtype=np.float32)
+    for begin in range(0, len(depth), _CHUNK):
+        part = slice(begin, begin + _CHUNK)
+        _see(caster, camera, T_world_stereo, model, part, depth[part])
+    measured = _disturb(depth.reshape(camera.shape), camera, model, rng)
+    shift = np.float32(camera.fx * model.baseline) / measured
+    u = np.arange(camera.width, dtype=np.float32)
+    measured[u - shift < -0.5] = np.nan  # the right eye's image ends
+    out = np.empty((*camera.shape, 3), dtype=np.float32)
+    out[..., 2] = measured
+    for axis in (0, 1):
+        np.multiply(measured, camera.rays[..., axis], out=out[..., axis], casting="same_kind")
+    return out
+
+
+def _see(
+    caster: Caster, camera: Camera, T_world_stereo: Float64, model: StereoModel, part: slice, depth: Float32
+) -> None:
+    """Fill in the exact depth of those of a part of the pixels that both eyes see well."""
+    lengths = camera.ray_lengths.reshape(-1)[part].astype(np.float32)
+    directions = unit_rays(camera, T_world_stereo, part)
     eye = T_world_stereo[:3, 3].astype(np.float32)
     hits = caster.cast(eye, directions)
-    seen = np.flatnonzero(hits.found)
-    tri = hits.triangle[seen]
-    normals = caster.facing(tri, directions[seen])
-    points = eye + hits.distance[seen, None] * directions[seen]
-    cosine = -np.einsum("ij,ij->i", normals, directions[seen])
-    good = (cosine > np.cos(model.grazing)) & (caster.geometry.albedo[tri] >= model.darkest)
-    good &= hits.distance[seen] < model.far * lengths[seen]
+    good = np.flatnonzero(hits.found & (hits.distance < np.float32(model.far) * lengths))
+    tri, towards, distance = hits.triangle[good], directions[good], hits.distance[good]
+    normals = caster.facing(tri, towards)
+    cosine = -np.einsum("ij,ij->i", normals, towards)
+    keep = (cosine > np.cos(model.grazing)) & (caster.geometry.albedo[tri] >= model.darkest)
+    points = eye + distance[:, None] * towards
     right_eye = transform_points(T_world_stereo, np.array([model.baseline, 0.0, 0.0]))
-    good[good] = ~caster.blocked(lift(points[good], normals[good]), right_eye)
-    depth = np.full(len(lengths), np.nan)
-    depth[seen[good]] = hits.distance[seen[good]] / lengths[seen[good]]
-    measured = _disturb(depth.reshape(camera.shape), camera, model, rng)
-    shift = camera.fx * model.baseline / measured
-    u = np.arange(camera.width)
-    measured[(u - shift < -0.5)] = np.nan  # the right eye's image ends
-    return (measured[..., None] * camera.rays).astype(np.float32)
+    keep[keep] = ~caster.blocked(lift(points[keep], normals[keep]), right_eye)
+    depth[good[keep]] = distance[keep] / lengths[good[keep]]
 
 
-def _disturb(depth: Float64, camera: Camera, model: StereoModel, rng: np.random.Generator) -> Float64:
-    from scipy.ndimage import gaussian_filter, grey_dilation, grey_erosion
+def _disturb(depth: Float32, camera: Camera, model: StereoModel, rng: np.random.Generator) -> Float32:
+    from scipy.ndimage import gaussian_filter
 
     out = depth.copy()
     if model.edge_outliers:
-        far = grey_dilation(np.nan_to_num(depth, nan=0.0), size=(5, 5))
-        near = grey_erosion(np.nan_to_num(depth, nan=99.0), size=(5, 5))
-        beside = np.isfinite(depth) & (far - near > 0.02 * depth) & (near < 99)
-        wrong = beside & (rng.random(depth.shape) < model.edge_outliers)
-        # A matching window across an edge answers anything between the two surfaces.
-        mix = rng.random(depth.shape)
-        out[wrong] = (near + mix * (far - near))[wrong]
+        _mismatch(out, depth, model.edge_outliers, rng)
     if model.disparity_noise:
-        noise = gaussian_filter(rng.standard_normal(depth.shape), model.correlation)
-        noise *= (
-            model.disparity_noise * 2 * np.sqrt(np.pi) * model.correlation
-        )  # the filter leaves 1 / (2 sqrt(pi) s)
-        out = out + out**2 / (camera.fx * model.baseline) * noise
+        noise = gaussian_filter(rng.standard_normal(depth.shape, dtype=np.float32), model.correlation)
+        # The filter leaves 1 / (2 sqrt(pi) s) of the noise.
+        noise *= np.float32(model.disparity_noise * 2 * np.sqrt(np.pi) * model.correlation)
+        out += out**2 / np.float32(camera.fx * model.baseline) * noise
     if model.dropout:
-        out[rng.random(depth.shape) < model.dropout] = np.nan
+        lost = rng.integers(0, out.size, rng.binomial(out.size, model.dropout))
+        out.reshape(-1)[lost] = np.nan
     return out
+
+
+def _mismatch(out: Float32, depth: Float32, share: float, rng: np.random.Generator) -> None:
+    """Match a share of the points beside depth edges wrongly: a window across an edge answers anything in between."""
+    from scipy.ndimage import grey_dilation, grey_erosion
+
+    missing = np.isnan(depth)
+    far = grey_dilation(np.where(missing, np.float32(0), depth), size=(5, 5))
+    near = grey_erosion(np.where(missing, np.float32(99), depth), size=(5, 5))
+    beside = np.flatnonzero(~missing & (far - near > 0.02 * depth))
+    wrong = beside[rng.random(len(beside)) < share]
+    low, high = near.reshape(-1)[wrong], far.reshape(-1)[wrong]
+    out.reshape(-1)[wrong] = low + rng.random(len(wrong), dtype=np.float32) * (high - low)

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices.sim.render import Caster, Float32, Geometry, Hits, Int64, lift
+from tofcapture.devices.sim.patches import cut_patches
+from tofcapture.devices.sim.render import Caster, Float32, Hits, Int64, lift
 from tofcapture.rig import SPEED_OF_LIGHT
 
 Complex64 = NDArray[np.complex64]
@@ -63,124 +64,32 @@ def wavenumbers(hz: Sequence[float]) -> tuple[float, ...]:
     return (0.0, *(2 * np.pi * f / SPEED_OF_LIGHT for f in hz))
 
 
-@dataclass(frozen=True)
-class Patches:
-    """The surfaces cut into patches: each triangle in n x n barycentric cells, neighbouring cells of like normal joined.
-
-    Attributes
-    ----------
-    divisions
-        (M,) n of each triangle.
-    first
-        (M,) where the triangle's cells begin in ``patch_of_cell``.
-    patch_of_cell
-        (C,) patch of each cell; -1 for cells outside the triangle.
-    cells
-        (S,) indices of real cells, sorted by patch.
-    cell_area
-        (S,) area of each, m^2.
-    start
-        (P + 1,) where each patch begins in ``cells``.
-    """
-
-    divisions: Int64
-    first: Int64
-    patch_of_cell: Int64
-    cells: Int64
-    cell_area: NDArray[np.float64]
-    start: Int64
-
-    @property
-    def count(self) -> int:
-        """Number of patches; each has two sides."""
-        return len(self.start) - 1
-
-    def side_of(self, geometry: Geometry, hits: Hits, directions: NDArray[Any]) -> Int64:
-        """(N,) ``2 * patch + side`` that each ray met, -1 for none; side 0 is the one the winding normal points to."""
-        found = hits.found
-        tri = np.where(found, hits.triangle, 0)
-        n = self.divisions[tri]
-        scaled = np.clip(hits.uv, 0.0, 1.0) * n[:, None]
-        i, j = (np.minimum(scaled[:, a].astype(np.int64), n - 1) for a in (0, 1))
-        upper = (scaled[:, 0] - i) + (scaled[:, 1] - j) > 1.0
-        # Rounding may put a hit on the hypotenuse just outside: pull it back into the triangle.
-        j = np.minimum(j, n - 1 - i)
-        upper &= i + j < n - 1
-        patch = self.patch_of_cell[self.first[tri] + (i * n + j) * 2 + upper]
-        normals = geometry.normals[tri]
-        behind = np.einsum("ij,ij->i", normals, np.asarray(directions, dtype=np.float32)) > 0
-        return np.where(found, 2 * patch + behind, -1)
-
-
-def cut_patches(geometry: Geometry, budget: int, least: int = 150) -> Patches:
-    """Cut a scene into about ``budget`` patches.
-
-    Parameters
-    ----------
-    geometry
-        The scene.
-    budget
-        Patches to spend; shared by area, but no object gets fewer than ``least``, so that a small object on a large
-        table still has a shape.
-    least
-        See above.
-    """
-    edges = geometry.corners[:, [1, 2, 0]] - geometry.corners
-    longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
-    objects = int(geometry.owner.max()) + 1
-    object_area = np.bincount(geometry.owner, weights=area, minlength=objects)
-    wanted = np.maximum(budget * object_area / area.sum(), least)
-    size = np.sqrt(object_area / wanted)[geometry.owner]
-    n = np.clip(np.ceil(longest / size), 1, 256).astype(np.int64)
-    first = np.concatenate([[0], np.cumsum(2 * n**2)])[:-1]
-    tri, i, j, upper = _cells(n)
-    index = first[tri] + (i * n[tri] + j) * 2 + upper
-    third = (1 + upper) / 3
-    u, v = (i + third) / n[tri], (j + third) / n[tri]
-    a, b, c = (geometry.corners[tri, k] for k in range(3))
-    centre = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    voxel = np.floor(centre / size[tri, None]).astype(np.int64)
-    axis = np.abs(geometry.normals[tri]).argmax(axis=1)
-    sign = np.take_along_axis(geometry.normals[tri], axis[:, None], axis=1)[:, 0] > 0
-    key = np.column_stack([geometry.owner[tri], voxel, 2 * axis + sign])
-    _, patch = np.unique(key, axis=0, return_inverse=True)
-    patch = patch.reshape(-1)
-    order = np.argsort(patch, kind="stable")
-    patch_of_cell = np.full(int((2 * n**2).sum()), -1, dtype=np.int64)
-    patch_of_cell[index] = patch
-    return Patches(
-        divisions=n,
-        first=first,
-        patch_of_cell=patch_of_cell,
-        cells=index[order],
-        cell_area=(area[tri] / n[tri] ** 2)[order],
-        start=np.searchsorted(patch[order], np.arange(patch.max() + 2)),
-    )
-
-
-def _cells(n: Int64) -> tuple[Int64, Int64, Int64, Int64]:
-    """Triangle, row, column and half of every barycentric cell that lies inside its triangle."""
-    tri = np.repeat(np.arange(len(n)), 2 * n**2)
-    within = np.arange(len(tri)) - np.repeat(np.cumsum(2 * n**2) - 2 * n**2, 2 * n**2)
-    upper, square = within % 2, within // 2
-    i, j = square // n[tri], square % n[tri]
-    inside = i + j + upper < n[tri]
-    return tri[inside], i[inside], j[inside], upper[inside]
-
-
-def _cosine_directions(normals: Float32, u: NDArray[Any], v: NDArray[Any]) -> Float32:
-    """Cosine-weighted directions about unit normals (N, 3) from numbers u, v in [0, 1)."""
+def _frames(normals: Float32) -> tuple[Float32, Float32]:
+    """Two unit vectors (N, 3) that stand upright on each unit normal (N, 3) and on each other."""
     x, y, z = (normals[:, k] for k in range(3))
     sign = np.where(z >= 0, np.float32(1), np.float32(-1))
     a = -1 / (sign + z)
     b = x * y * a  # branchless frame: Duff et al., JCGT 6(1), 2017
+    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    second = np.stack([b, sign + y * y * a, -y], axis=1)
+    return first, second
+
+
+def _cosine_weighted(u: NDArray[Any], v: NDArray[Any]) -> tuple[Float32, Float32, Float32]:
+    """Coordinates of cosine-weighted directions, the normal last, from numbers u, v in [0, 1)."""
     r, angle = np.sqrt(u).astype(np.float32), (2 * np.pi * v).astype(np.float32)
-    p, q, w = r * np.cos(angle), r * np.sin(angle), np.sqrt(np.maximum(0, 1 - u)).astype(np.float32)
-    out = np.empty_like(normals)
-    out[:, 0] = p * (1 + sign * x * x * a) + q * b + w * x
-    out[:, 1] = p * (sign * b) + q * (sign + y * y * a) + w * y
-    out[:, 2] = p * (-sign * x) - q * y + w * z
+    return r * np.cos(angle), r * np.sin(angle), np.sqrt(np.maximum(0, 1 - u)).astype(np.float32)
+
+
+def _cosine_directions(normals: Float32, u: NDArray[Any], v: NDArray[Any]) -> Float32:
+    """Cosine-weighted directions (N, R, 3) about unit normals (N, 3) from numbers u, v (N, R) in [0, 1)."""
+    first, second = _frames(normals)
+    p, q, w = _cosine_weighted(u, v)
+    out = np.empty((*p.shape, 3), dtype=np.float32)
+    for k in range(3):
+        np.multiply(p, first[:, k, None], out=out[..., k])
+        out[..., k] += q * second[:, k, None]
+        out[..., k] += w * normals[:, k, None]
     return out
 
 
@@ -204,16 +113,31 @@ def direct(
     -------
     (len(k), N) complex64, strength x ``cos / d^2 exp(i k d)``, zero in shadow and from behind; 1/m^2.
     """
-    to_light = lamp.position.astype(np.float32) - points.astype(np.float32)
+    strength, d, lit = _lit(caster, points.astype(np.float32), normals, lamp)
+    h = np.zeros((len(k), len(points)), dtype=np.complex64)
+    for c, kk in enumerate(k):
+        h[c, lit] = strength * turn(kk * d)
+    return h
+
+
+def _lit(
+    caster: Caster, points: Float32, normals: Float32, lamp: Lamp
+) -> tuple[Float32, Float32, NDArray[np.int64]]:
+    """Irradiance, distance, and indices of the points (N, 3) that the lamp reaches; rays only where light could arrive."""
+    to_light = lamp.position.astype(np.float32) - points
     d = np.sqrt(np.einsum("ij,ij->i", to_light, to_light))
     cosine = np.einsum("ij,ij->i", to_light, normals) / d
-    lit = cosine > 0
-    lit[lit] = ~caster.blocked(lift(points[lit], normals[lit]), lamp.position)
-    h = np.where(lit, cosine / d**2, 0).astype(np.float32) * lamp.strength(-to_light / d[:, None])
-    return np.stack([h * _turn(kk * d) for kk in k])
+    lit = np.flatnonzero(cosine > 0)
+    strength = np.broadcast_to(lamp.strength(-to_light[lit] / d[lit, None]), lit.shape)
+    lit, strength = lit[strength > 0], strength[strength > 0]
+    free = ~caster.blocked(lift(points[lit], normals[lit]), lamp.position)
+    lit = lit[free]
+    e: Float32 = strength[free] * cosine[lit] / d[lit] ** 2
+    return e.astype(np.float32), d[lit], lit
 
 
-def _turn(phase: NDArray[Any]) -> Complex64:
+def turn(phase: NDArray[Any]) -> Complex64:
+    """``exp(i phase)``."""
     out = np.empty(phase.shape, dtype=np.complex64)
     out.real, out.imag = np.cos(phase), np.sin(phase)
     return out
@@ -276,9 +200,9 @@ class Transport:
         sides, rays = 2 * self.patches.count, self._rays
         k = np.arange(rays)
         shift = self._rng.random((2, sides, 1))
-        u = (((k + 0.5) / rays + shift[0]) % 1.0).reshape(-1)
-        v = ((k * _GOLDEN + shift[1]) % 1.0).reshape(-1)
-        directions = _cosine_directions(normals, u, v)
+        u = (((k + 0.5) / rays + shift[0]) % 1.0).reshape(-1, 1)
+        v = ((k * _GOLDEN + shift[1]) % 1.0).reshape(-1, 1)
+        directions = _cosine_directions(normals, u, v)[:, 0]
         hits = self.caster.cast(lift(points, normals), directions)
         column = self.patches.side_of(self.caster.geometry, hits, directions)
         row = np.repeat(np.arange(sides), rays)
@@ -286,7 +210,7 @@ class Transport:
         row, column, r = row[found], column[found], hits.distance[found]
         out = []
         for wavenumber in self.k:
-            weight = _turn(wavenumber * r) * (self.albedo[column] / rays)
+            weight = turn(wavenumber * r) * (self.albedo[column] / rays)
             out.append(csr_matrix((weight, (row, column)), shape=(sides, sides)))
         return out
 
@@ -352,34 +276,41 @@ class Transport:
         -------
         (len(k), N) complex64, 1/m^2
         """
-        geometry = self.caster.geometry
         count = len(points)
         total = np.zeros((len(self.k), count), dtype=np.complex64)
         lifted = lift(points, normals)
         s = np.arange(rays)
-        patterns = int(pattern.max()) + 1 if count else 1
-        shift = np.stack([np.arange(patterns) * 0.7548776662 % 1.0, np.arange(patterns) * 0.5698402910 % 1.0])
-        step = max(1, 1_500_000 // rays)
+        patterns = np.arange(int(pattern.max()) + 1 if count else 1)[:, None]
+        u = ((s + 0.5) / rays + patterns * 0.7548776662 % 1.0 / rays) % 1.0
+        v = (s * _GOLDEN + patterns * 0.5698402910 % 1.0) % 1.0
+        step = max(1, 100_000 // rays)  # what a step needs stays in the cache
         for begin in range(0, count, step):
             part = slice(begin, begin + step)
-            here = pattern[part, None]
-            u = ((s + 0.5) / rays + shift[0][here] / rays) % 1.0
-            v = (s * _GOLDEN + shift[1][here]) % 1.0
-            n = np.repeat(normals[part], rays, axis=0)
-            directions = _cosine_directions(n, u.reshape(-1), v.reshape(-1))
-            origins = np.repeat(lifted[part], rays, axis=0)
-            hits = self.caster.cast(origins, directions)
-            side = self.patches.side_of(geometry, hits, directions)
-            found = np.flatnonzero(side >= 0)
-            r = hits.distance[found]
-            met = origins[found] + r[:, None] * directions[found]
-            facing = self.caster.facing(hits.triangle[found], directions[found])
-            h = direct(self.caster, met, facing, lamp, self.k) + solution[:, side[found]]
-            h *= geometry.albedo[hits.triangle[found]] / rays
-            owner = found // rays
-            for c, kk in enumerate(self.k):
-                arriving = h[c] * _turn(kk * r)
-                real = np.bincount(owner, arriving.real, minlength=len(n) // rays)
-                imag = np.bincount(owner, arriving.imag, minlength=len(n) // rays)
-                total[c, part] = real + 1j * imag
+            directions = _cosine_directions(normals[part], u[pattern[part]], v[pattern[part]])
+            total[:, part] = self._arriving(lifted[part], directions, lamp, solution)
+        return total
+
+    def _arriving(self, origins: Float32, directions: Float32, lamp: Lamp, solution: Complex64) -> Complex64:
+        """Mean (len(k), N) over rays from origins (N, 3) in directions (N, R, 3) of the light that comes along them."""
+        geometry, shape = self.caster.geometry, directions.shape[:2]
+        origins = np.repeat(origins, shape[1], axis=0)
+        directions = directions.reshape(-1, 3)
+        hits = self.caster.cast(origins, directions)
+        found = np.flatnonzero(hits.found)
+        hits = Hits(hits.distance[found], hits.triangle[found], hits.uv[found])
+        directions = directions[found]
+        r = hits.distance
+        side = self.patches.side_of(geometry, hits, directions)
+        facing = geometry.normals[hits.triangle] * (1 - 2 * (side & 1)).astype(np.float32)[:, None]
+        met = origins[found] + r[:, None] * directions
+        strength, d, lit = _lit(self.caster, met, facing, lamp)
+        weight = geometry.albedo[hits.triangle] / np.float32(shape[1])
+        strength *= weight[lit]
+        ray = np.zeros(shape[0] * shape[1], dtype=np.complex64)
+        total = np.empty((len(self.k), shape[0]), dtype=np.complex64)
+        for c, kk in enumerate(self.k):
+            light = solution[c, side] * weight * turn(kk * r)
+            light[lit] += strength * turn(kk * (r[lit] + d))
+            ray[found] = light
+            total[c] = ray.reshape(shape).sum(axis=1)
         return total

@@ -19,6 +19,7 @@ import numpy as np
 from tofcapture.camera import Camera
 from tofcapture.devices.sim import sensor as sensors
 from tofcapture.devices.sim import stereo as stereos
+from tofcapture.devices.sim.faults import FaultPlan, Faults, read_faults
 from tofcapture.devices.sim.light import Light, exact_view, light_at_pixels
 from tofcapture.devices.sim.render import Caster, merge
 from tofcapture.devices.sim.scene import SceneObject
@@ -182,6 +183,7 @@ class SimWorld:
         self._pose: tuple[Float64, bytes] | None = None
         self._built: tuple[str, Caster, Transport | None] | None = None
         self._lit: tuple[object, Light] | None = None
+        self.faults = Faults(FaultPlan())
         self.tof_info = TofInfo(
             model="simulated 240x180 20/100 MHz",
             serial=f"sim-tof-{seed}",
@@ -246,7 +248,8 @@ class SimWorld:
             raise DeviceError(
                 "no scene stands on the simulated table", hint="call operator.place(scene) first"
             )
-        return self._pose
+        T_base_flange, key = self._pose
+        return T_base_flange @ self.faults.offset, key
 
     def _rng(self, device: str) -> np.random.Generator:
         return _generator(device, self.seed, self._scene, self._here()[1])
@@ -324,19 +327,21 @@ class SimWorld:
 def shared_world(context: StationContext) -> SimWorld:
     """Return the world that all simulated drivers of one station share; made by the first that asks.
 
-    The station file's ``[sim]`` table holds ``seed``, optionally ``meshes`` (a folder) with ``mesh_unit``, and overrides of
-    constants.toml.
+    The station file's ``[sim]`` table holds ``seed``, optionally ``meshes`` (a folder) with ``mesh_unit``, ``faults`` on demand, and
+    overrides of constants.toml.
     """
     from tofcapture.devices.sim.scenes import scene_objects
 
     if "sim" not in context.shared:
         table = dict(context.config.get("sim", {}))
         seed = int(table.pop("seed", 0))
+        faults = read_faults(table.pop("faults", {}))
         meshes, unit = table.pop("meshes", None), str(table.pop("mesh_unit", "m"))
         unknown = table.keys() - set(TABLES)
         if unknown:
             raise ConfigError(
-                f"[sim] does not know {', '.join(sorted(unknown))}", hint=f"it knows seed, meshes, {TABLES}"
+                f"[sim] does not know {', '.join(sorted(unknown))}",
+                hint=f"it knows seed, meshes, mesh_unit, faults, {TABLES}",
             )
         folder = None if meshes is None else context.folder / meshes
         paths = (
@@ -348,6 +353,8 @@ def shared_world(context: StationContext) -> SimWorld:
         def scenes(name: str, scene_seed: int) -> Sequence[SceneObject]:
             return scene_objects(name, scene_seed, paths, unit)
 
-        context.shared["sim"] = SimWorld(read_constants(table, "station file"), seed, scenes)
+        made = SimWorld(read_constants(table, "station file"), seed, scenes)
+        made.faults = Faults(faults)
+        context.shared["sim"] = made
     world: SimWorld = context.shared["sim"]
     return world

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from tofcapture.devices.sim import VERSION
 from tofcapture.devices.sim.meshes import metres_per, read_mesh
 from tofcapture.devices.sim.scene import SceneObject
 from tofcapture.devices.sim.world import TABLES, Constants, SimWorld, idealised, read_constants
@@ -150,6 +151,7 @@ def simulate(path: Path, *, ideal: bool, frames: int) -> View:
         rig=world.true_rig if ideal else world.nominal_rig(),
         provenance={
             "made_by": "tofcapture simulate",
+            "simulator": VERSION,
             "world": path.name,
             "ideal": ideal,
             "seed": world_file.seed,

@@ -1,0 +1,165 @@
+"""simulate-dataset: one command from nothing to a whole dataset, the same bytes however often it is interrupted."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.test_sim_world import SMALL
+from tofcapture.cli import main
+from tofcapture.errors import ConfigError
+from tofcapture.files.manifest import load_manifest
+from tofcapture.files.shard import ShardReader
+from tofcapture.suites import capture, make
+from tofcapture.suites.make import Wish, make_one
+from tofcapture.suites.run import simulate_dataset
+
+STEREO = {"width": 160, "height": 128, "fx": 144.4, "fy": 144.4, "cx": 79.5, "cy": 63.5}
+SIM = {**SMALL, "stereo": STEREO}
+STATION = "\n".join(
+    [
+        *(f'[{role}]\ndriver = "sim"' for role in ("tof", "stereo", "operator")),
+        '[arm]\ndriver = "sim"\nmodel = "ur10e"\n[sim]\nseed = 0',
+        *(f"[sim.{name}]\n" + "\n".join(f"{k} = {v}" for k, v in t.items()) for name, t in SIM.items()),
+    ]
+)
+
+
+def wish(suite="multipath", scenes=2, frames=2):
+    return Wish(suite, 0, scenes, views=2, frames=frames, sim=SIM)
+
+
+def shards(out):
+    return {name: entry.sha256 for name, entry in load_manifest(out).scenes.items()}
+
+
+@pytest.fixture(scope="module")
+def station(tmp_path_factory):
+    path = tmp_path_factory.mktemp("station") / "station.toml"
+    path.write_text(STATION)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted run of two multipath scenes."""
+    out = tmp_path_factory.mktemp("whole") / "data"
+    simulate_dataset(wish(), out, jobs=1)
+    return out
+
+
+def test_four_scenes_in_one_command(tmp_path, station, capsys):
+    """Shards, manifest, card; check finds nothing; time and disk of a hundred scenes are stated; again does nothing."""
+    out = tmp_path / "data"
+    line = ["simulate-dataset", "--scenes", "4", "--views", "2", "--frames", "2", "--jobs", "1"]
+    line += ["--out", str(out), "--station", str(station), "--json"]
+    assert main(line) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert (answer["scenes"], answer["views"]) == (4, 8)
+    assert answer["extrapolated"]["scenes"] == 100
+    assert answer["extrapolated"]["hours"] > 0
+    assert {"light", "stereo", "tof", "truth", "write", "build"} <= answer["cpu_seconds_per_view"].keys()
+    assert set(answer["splits"].values()) == {"train", "test"}
+    assert answer["gt"]["coverage"] > 0
+    assert (out / "README.md").is_file()
+    assert not list((out / "simulation").glob("*.work"))
+    assert main(["check", str(out)]) == 0
+    before = shards(out)
+    capsys.readouterr()
+    assert main(line) == 0
+    assert len(json.loads(capsys.readouterr().out)["kept"]) == 4
+    assert shards(out) == before
+
+
+def test_shards_tell_where_they_came_from(whole):
+    """The note beside the shards holds recipe, objects and facts; the shard has truth and the wanted views."""
+    for name in shards(whole):
+        note = json.loads((whole / "simulation" / f"{name}.json").read_text())
+        assert note["objects"] == [name]
+        assert {"kind", "angle_deg", "albedo"} <= note["facts"].keys()
+        with ShardReader(whole / "shards" / f"{name}.h5") as shard:
+            assert (shard.views, shard.frames) == (2, 2)
+            assert shard.truth(0) is not None
+
+
+def test_interrupted_in_the_middle_of_a_scene(tmp_path, whole, monkeypatch):
+    """Stopped at the second view, the next run takes the missing view only and ends with the same bytes."""
+    out, written, write = tmp_path / "data", [], capture.write_view
+
+    def stop(path, view):
+        if len(written) == 1:
+            raise KeyboardInterrupt
+        written.append(path)
+        return write(path, view)
+
+    monkeypatch.setattr(capture, "write_view", stop)
+    with pytest.raises(KeyboardInterrupt):
+        simulate_dataset(wish(), out, jobs=1)
+    monkeypatch.setattr(capture, "write_view", write)
+    result = simulate_dataset(wish(), out, jobs=1)
+    assert result.made[0].cpu["views"] == 1
+    assert shards(out) == shards(whole)
+
+
+def test_a_damaged_or_missing_shard_is_made_again(tmp_path, whole):
+    """Only that scene is simulated again, with the same bytes; other options or fewer scenes are refused."""
+    out = tmp_path / "data"
+    simulate_dataset(wish(), out, jobs=1)
+    first, second = sorted(shards(out))
+    (out / "shards" / f"{first}.h5").unlink()
+    result = simulate_dataset(wish(), out, jobs=1)
+    assert [m.scene for m in result.made] == [first]
+    assert [m.scene for m in result.kept] == [second]
+    assert shards(out) == shards(whole)
+    with pytest.raises(ConfigError, match="other options"):
+        simulate_dataset(wish(frames=3), out, jobs=1)
+    with pytest.raises(ConfigError, match="not wanted"):
+        simulate_dataset(wish(scenes=1), out, jobs=1)
+
+
+def test_views_of_another_wish_are_not_mixed_in(tmp_path, whole):
+    """Views left by a run with other options go before the scene is taken."""
+    out = tmp_path / "data"
+    other = Wish("multipath", 0, 2, views=2, frames=1, sim=SIM)
+    name = make.scene_name(other, 0)
+    (out / "simulation" / f"{name}.work").mkdir(parents=True)
+    (out / "simulation" / f"{name}.work" / "task").write_text(other.task(0))
+    left = out / "simulation" / f"{name}.work" / "recording" / "views" / name / "view-000.h5"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"of another wish")
+    assert make_one(wish(), out, 0).sha256 == shards(whole)[name]
+
+
+@pytest.mark.parametrize(("change", "message"), [({"scenes": 0}, "scenes"), ({"suite": "tof1"}, "suite")])
+def test_wrong_wishes_are_refused(tmp_path, change, message):
+    """Nothing wanted, or a suite that does not exist."""
+    with pytest.raises(ConfigError, match=message):
+        simulate_dataset(wish(**change), tmp_path / "data", jobs=1)
+
+
+def test_a_recording_is_not_overwritten(tmp_path):
+    """A folder that holds a recording is not taken for a dataset."""
+    (tmp_path / "views").mkdir()
+    with pytest.raises(ConfigError, match="recording"):
+        simulate_dataset(wish(), tmp_path, jobs=1)
+
+
+@pytest.mark.slow
+def test_processes_and_sigkill_give_the_same_bytes(tmp_path, station, whole):
+    """Two processes, killed after the first views with all their children, then run again: the same shards."""
+    out = tmp_path / "data"
+    line = [sys.executable, "-m", "tofcapture", "simulate-dataset", "--suite", "multipath", "--scenes", "2"]
+    line += ["--views", "2", "--frames", "2", "--jobs", "2", "--out", str(out), "--station", str(station)]
+    run = subprocess.Popen(line, start_new_session=True, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list(out.glob("simulation/*.work/recording/views/*/view-*.h5")):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(run.pid, signal.SIGKILL)
+    run.wait()
+    subprocess.run(line, check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    assert shards(out) == shards(whole)
