@@ -143,7 +143,7 @@ def replaced(name, array):
 
 
 SHARD_DAMAGE = {
-    "version": (set_attr("version", 2), "version"),
+    "version": (set_attr("version", 3), "version"),
     "foreign format": (set_attr("format", "x"), "format"),
     "units": (set_attr("units", "mm"), "units"),
     "rig": (set_attr("rig", "units = 'm'"), "rig"),

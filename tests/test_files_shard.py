@@ -260,14 +260,14 @@ def test_the_layouts_are_pinned():
         "truth/T_tof_stereo": "float64 4 4 ?",
         "truth/T_flange_tof": "float64 4 4 ?",
     }
-    assert (SHARD.format, SHARD.version) == ("tofcapture-shard", 1)
+    assert (SHARD.format, SHARD.version) == ("tofcapture-shard", 2)
     assert summary(SHARD) == {
         "tof/raw": "uint16|float64 N F K H W",
         "tof/celsius": "float64 N F",
         "tof/time_ns": "int64 N F",
         "tof/depth": "float32 N H W",
         "tof/confidence": "float32 N H W",
-        "tof/saturated": "bool N H W",
+        "tof/flags": "uint8 N H W",
         "gt/native_depth": "float32 N SH SW",
         "gt/depth_1x": "float32 N H W",
         "gt/normals_1x": "float32 N H W 3",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,24 +15,14 @@ from torch.utils.data import Dataset
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
 from tofcapture.files.layout import MaskBit
-from tofcapture.files.manifest import load_manifest
-from tofcapture.files.shard import ShardReader
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoded, ambiguity, decode, frequencies, phasors
 from tofcapture_model.frame import Frame, Target
 from tofcapture_model.multipath import cues
+from tofcapture_model.shards import SampleId, all_samples, open_scenes
 
 Float32 = NDArray[np.float32]
 MAX_RANGE = 5.0  # m; a decoded depth beyond it is an unwrapping failure on this rig and counts as a hole
-
-
-@dataclass(frozen=True)
-class SampleId:
-    """Which frame: scene name, view, frame."""
-
-    scene: str
-    view: int
-    frame: int
 
 
 def fill_nearest(image: Float32, valid: NDArray[np.bool_]) -> Float32:
@@ -155,6 +144,8 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         Use only the first so many frames of every view; 0: all.
     cache_bytes
         Decoded frames are kept in memory up to this size.
+    cache
+        Folder that ``tofcapture pack`` filled with this split; ``None`` reads the shards.
     """
 
     def __init__(
@@ -167,16 +158,11 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         seed: int = 0,
         frames: int = 0,
         cache_bytes: float = 1.5e9,
+        cache: Path | None = None,
     ) -> None:
-        entries = load_manifest(folder).split(split)
-        self.readers = {name: ShardReader(Path(folder) / entry.path) for name, entry in entries.items()}
+        self.readers = open_scenes(folder, split, cache)
         self.size, self.flip, self.seed, self.cache_bytes = tuple(size), flip, seed, cache_bytes
-        self.samples = [
-            SampleId(name, view, frame)
-            for name, reader in self.readers.items()
-            for view in range(reader.views)
-            for frame in range(min(frames or reader.frames, reader.frames))
-        ]
+        self.samples = all_samples(self.readers, frames)
         if not self.samples:
             raise DataError(
                 f"{folder}: the split {split} is empty", hint="record more scenes, or choose another --split"

@@ -121,7 +121,7 @@ def _check_open(file: h5py.File, path: Path) -> Iterator[Problem]:
             path,
             "version",
             f"expected {layout.version}, got {file.attrs.get('version')!r}",
-            "upgrade tofcapture",
+            f"tofcapture migrate {path}" if file.attrs.get("version") == 1 else "upgrade tofcapture",
         )
         return
     info, problems = _descriptions(file, path, layout)

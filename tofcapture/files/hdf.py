@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +71,8 @@ def dumps(value: Any) -> str:
     return json.dumps(value, sort_keys=True, default=_plain)
 
 
-def open_checked(path: Path, layout: Layout, **options: Any) -> h5py.File:
-    """Open a file for reading and make sure that it is what the layout says.
+def open_checked(path: Path, layout: Layout, *earlier: Layout) -> h5py.File:
+    """Open a file for reading and make sure that it is of the layout, or of an earlier one that the caller can read.
 
     Raises
     ------
@@ -82,29 +82,29 @@ def open_checked(path: Path, layout: Layout, **options: Any) -> h5py.File:
         HDF5 of another format or version.
     """
     try:
-        file = h5py.File(path, "r", **options)
+        file = h5py.File(path, "r")
     except FileNotFoundError as err:
         raise DataError(f"{path}: expected a {layout.format} file, found nothing there") from err
     except (OSError, RuntimeError, ValueError) as err:
         raise DataError(f"{path}: cannot be opened as HDF5: {err}", hint=f"tofcapture check {path}") from err
     try:
-        _check_format(file, path, layout)
+        _check_format(file, path, layout, [old.version for old in earlier])
     except BaseException:
         file.close()
         raise
     return file
 
 
-def _check_format(file: h5py.File, path: Path, layout: Layout) -> None:
+def _check_format(file: h5py.File, path: Path, layout: Layout, earlier: Sequence[int]) -> None:
     found, version = text_attr(file, "format", path), attr(file, "version", path)
     if found != layout.format:
         raise FormatError(f"{path}: expected format {layout.format}, got {found!r}")
-    if version != layout.version:
+    if version not in (layout.version, *earlier):
         raise FormatError(
             f"{path}: expected {layout.format} version {layout.version}, got {version}",
             hint="a newer tofcapture wrote it: upgrade"
             if version > layout.version
-            else "convert it or record it again",
+            else f"tofcapture migrate {path}",
         )
 
 

@@ -7,8 +7,25 @@ Writers create what is listed here, readers fetch it, :mod:`tofcapture.files.che
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
+
+from tofcapture.flags import TOF_FLAG_DOCS, TofFlag
+
+__all__ = [
+    "BOARD_SCENE",
+    "LAYOUTS",
+    "MASK_DOCS",
+    "SHARD",
+    "SHARD_1",
+    "SPLITS",
+    "TOF_FLAG_DOCS",
+    "VIEW",
+    "Field",
+    "Layout",
+    "MaskBit",
+    "TofFlag",
+]
 
 BOARD_SCENE = "calibration"  # views of the board; never part of a dataset
 SPLITS = ("train", "val", "test")
@@ -202,7 +219,7 @@ def _projected(scale: int) -> tuple[Field, ...]:
 
 SHARD = Layout(
     format="tofcapture-shard",
-    version=1,
+    version=2,
     title="Shard `DATASET/shards/<scene>.h5`",
     fields=(
         Field("tof/raw", _RAW, ("N", "F", "K", "H", "W"), "DN", "phase images, as the sensor gave them", 2),
@@ -219,7 +236,7 @@ SHARD = Layout(
         Field(
             "tof/confidence", _F32, ("N", "H", "W"), "DN", "amplitude of the highest frequency, burst mean", 1
         ),
-        Field("tof/saturated", _BOOL, ("N", "H", "W"), "1", "a tap of a frame reached saturation", 1),
+        Field("tof/flags", ("uint8",), ("N", "H", "W"), "1", "flag bits, see below; 0: a good pixel", 1),
         Field(
             "gt/native_depth",
             _F32,
@@ -259,9 +276,21 @@ SHARD = Layout(
     ),
     attrs=(
         ("format", "text", "`tofcapture-shard`"),
-        ("version", "int", "1"),
+        ("version", "int", "2"),
         ("scene", "text", "name of the scene"),
         *_DESCRIPTION_ATTRS,
+    ),
+)
+
+# Version 1 had one bit of the flags as an array of its own; readers still take it, `tofcapture migrate` rewrites it.
+SHARD_1 = replace(
+    SHARD,
+    version=1,
+    fields=tuple(
+        Field("tof/saturated", _BOOL, ("N", "H", "W"), "1", "a tap of a frame reached saturation", 1)
+        if f.path == "tof/flags"
+        else f
+        for f in SHARD.fields
     ),
 )
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from tofcapture.files.layout import MASK_DOCS, SHARD, VIEW, Layout
+from collections.abc import Mapping
+
+from tofcapture.files.layout import MASK_DOCS, SHARD, TOF_FLAG_DOCS, VIEW, Layout, MaskBit, TofFlag
 
 _INTRODUCTION = """\
 # Formats
@@ -25,11 +27,25 @@ _OTHERS = """\
 "versions": {...}}`; `path` is relative to the dataset, `split` is train, val or test. Scenes of one object (the name up to a
 trailing `-<digits>`) are always in the same split.
 
+## Cache `CACHE/index.json`, `CACHE/<scene>.bin`
+
+One split of a dataset, packed for training: `tofcapture.files.cache.pack`. A `.bin` file is one record per view, without a
+header, of `{"raw": F x K x H x W, "celsius": F, "depth", "normals", "mask"}`, ground truth at 2x; `index.json` holds
+`"format": "tofcapture-cache"`, `"version": 1`, `"split"` and per scene the record's `dtype` (as numpy describes it), `views`,
+`sha256` of the file, `shard_sha256` of the shard that it was packed from, `rig`, `tof_info`. A cache whose shards have changed is
+refused. `numpy.memmap(path, dtype)` opens it.
+
 ## `rig.toml`
 
 `format = "tofcapture-rig"`, `version = 1`, `units = "m"`; tables `[tof]` (width, height, fx, fy, cx, cy, illuminator) and
 `[stereo]` (width, height, fx, fy, cx, cy); `T_tof_stereo` and `T_flange_tof` as 4 x 4 lists; any number of `[[range_error]]`
 (modulation_hz, offset, scale, harmonics as `[order, cosine, sine]`, per_pixel_radius, per_kelvin, reference_celsius).
+"""
+
+
+_VERSIONS = """\
+Version 1 held `/tof/saturated` (bool, N x H x W) in place of `/tof/flags`, and was otherwise the same. Readers take it as it
+is; `tofcapture migrate PATH` rewrites a shard or a whole dataset as version 2, with the digests and the manifest.
 """
 
 
@@ -59,16 +75,24 @@ def _section(layout: Layout) -> str:
     )
 
 
-def _mask_section() -> str:
-    rows = [f"| {bit.value} | `{bit.name}` | {doc} |" for bit, doc in MASK_DOCS.items()]
-    return "\n".join(
-        ["## Mask bits of `/gt/mask_*`", "", "| bit | name | meaning |", "|---|---|---|", *rows, ""]
-    )
+def _bits_section(title: str, docs: Mapping[MaskBit, str] | Mapping[TofFlag, str]) -> str:
+    rows = [f"| {bit.value} | `{bit.name}` | {doc} |" for bit, doc in docs.items()]
+    return "\n".join([f"## {title}", "", "| bit | name | meaning |", "|---|---|---|", *rows, ""])
 
 
 def formats_markdown() -> str:
     """Text of ``docs/formats.md``."""
-    return "\n".join([_INTRODUCTION, _section(VIEW), _section(SHARD), _mask_section(), _OTHERS])
+    return "\n".join(
+        [
+            _INTRODUCTION,
+            _section(VIEW),
+            _section(SHARD),
+            _VERSIONS,
+            _bits_section("Mask bits of `/gt/mask_*`", MASK_DOCS),
+            _bits_section("Flag bits of `/tof/flags`", TOF_FLAG_DOCS),
+            _OTHERS,
+        ]
+    )
 
 
 if __name__ == "__main__":

@@ -68,7 +68,8 @@ def sealed_digest(path: Path) -> str:
     return found
 
 
-def _fsync(path: Path) -> None:
+def fsync(path: Path) -> None:
+    """Make sure that a file, or a folder's list of names, is on the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -80,9 +81,9 @@ def write_text(path: Path, text: str) -> None:
     """Replace a text file atomically: readers see the old one or the new one, also after a power cut."""
     partial = partial_path(path)
     partial.write_text(text, encoding="utf-8")
-    _fsync(partial)
+    fsync(partial)
     partial.replace(path)
-    _fsync(path.parent)
+    fsync(path.parent)
 
 
 def seal(partial: Path, path: Path) -> str:
@@ -95,9 +96,9 @@ def seal(partial: Path, path: Path) -> str:
     SHA-256 of the file, hexadecimal.
     """
     digest = sha256_of(partial)
-    _fsync(partial)
+    fsync(partial)
     partial.chmod(0o444)
     write_text(digest_path(path), f"{digest}  {path.name}\n")
     partial.replace(path)
-    _fsync(path.parent)
+    fsync(path.parent)
     return digest

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError, FormatError
-from tofcapture.files.hdf import Array, json_attr, open_checked, text_attr
+from tofcapture.files.hdf import Array, attr, json_attr, open_checked, text_attr
 from tofcapture.files.info import stereo_from, tof_from
-from tofcapture.files.layout import SHARD
+from tofcapture.files.layout import SHARD, SHARD_1, TofFlag
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.ops.normals import normals_from_depth
 from tofcapture.poses import Float64
@@ -65,13 +65,19 @@ class TofMaps:
         (H, W) float32, metres; NaN: none.
     confidence
         (H, W) float32, amplitude of the highest frequency, raw units.
-    saturated
-        (H, W) bool.
+    flags
+        (H, W) uint8, bits of :class:`tofcapture.flags.TofFlag`; 0 is a good pixel. An array of bool says which are saturated.
     """
 
     depth: Float32
     confidence: Float32
-    saturated: NDArray[np.bool_]
+    flags: NDArray[np.uint8]
+
+    @property
+    def saturated(self) -> NDArray[np.bool_]:
+        """(H, W) bool, a tap of a frame reached saturation."""
+        out: NDArray[np.bool_] = (self.flags & np.uint8(TofFlag.SATURATED)) != 0
+        return out
 
 
 @dataclass(frozen=True)
@@ -157,7 +163,7 @@ class ShardReader:
     def _open(self) -> h5py.File:
         if self._file is None or self._pid != os.getpid():
             # A handle that crossed a fork shares its file offset with the parent: leave it alone and open anew.
-            self._file, self._datasets, self._pid = open_checked(self.path, SHARD), {}, os.getpid()
+            self._file, self._datasets, self._pid = open_checked(self.path, SHARD, SHARD_1), {}, os.getpid()
         return self._file
 
     def _dataset(self, name: str) -> h5py.Dataset:
@@ -183,6 +189,11 @@ class ShardReader:
             raise DataError(
                 f"{self.path}: {where} is damaged: {err}", hint=f"tofcapture check {self.path}"
             ) from err
+
+    @cached_property
+    def version(self) -> int:
+        """Version of the format that the file is of."""
+        return int(attr(self._open(), "version", self.path))
 
     @cached_property
     def scene(self) -> str:
@@ -234,7 +245,12 @@ class ShardReader:
 
     def tof(self, view: int) -> TofMaps:
         """Decoded burst."""
-        return TofMaps(*(self._row(f"tof/{name}", view) for name in ("depth", "confidence", "saturated")))
+        return TofMaps(self._row("tof/depth", view), self._row("tof/confidence", view), self.flags(view))
+
+    def flags(self, view: int) -> NDArray[np.uint8]:
+        """(H, W) uint8, bits of :class:`tofcapture.flags.TofFlag`; a shard of version 1 knows of saturation only."""
+        name = "tof/flags" if self.version > SHARD_1.version else "tof/saturated"
+        return self._row(name, view).astype(np.uint8, copy=False)
 
     def ground_truth(self, view: int, scale: Scale) -> GroundTruth:
         """Depth, normals and mask at 1x or 2x of the ToF image."""

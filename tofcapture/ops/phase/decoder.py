@@ -1,0 +1,250 @@
+"""Decoding at the speed of the sensor and more: one camera's tables built once, float32, blocks that stay in the cache.
+
+The same mathematics as :func:`tofcapture.ops.phase.decode`, which is its oracle in the tests. Only additions, products,
+quotients and square roots of float32 are used, so that the same frame gives the same bits on every machine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.errors import DataError
+from tofcapture.flags import TofFlag
+from tofcapture.frames import TofInfo
+from tofcapture.ops.phase.float32 import Correction, Float32, combine, tap_weights, turns_of
+from tofcapture.ops.phase.flying import flying_pixels
+from tofcapture.ops.phase.phasor import ambiguity, frequencies
+from tofcapture.ops.phase.unwrapping import whole_ratio
+from tofcapture.rig import RangeError
+
+_BLOCK = 1 << 16  # pixels; temporaries stay in a core's caches, and calls stay long against their overhead
+_AMBIGUOUS = 0.25  # wraps of disagreement between the frequencies
+_UNCERTAIN = 0.020  # m, standard deviation from which a pixel is of low confidence
+_UNKNOWN_CELSIUS = 45.0
+
+
+@dataclass(frozen=True)
+class TapNoise:
+    """Noise of one tap of one frame: variance ``tap / electrons_per_unit + read^2`` in raw units squared.
+
+    Attributes
+    ----------
+    electrons_per_unit
+        Photo-electrons per raw unit.
+    read
+        Standard deviation of the electronics, raw units.
+    """
+
+    electrons_per_unit: float = 16.0
+    read: float = 1.25
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """What the fast decoder yields, each (H, W).
+
+    Attributes
+    ----------
+    depth
+        float32, z, metres; NaN where a tap is saturated or nothing can be decoded.
+    confidence
+        float32, amplitude of the high frequency, raw units.
+    flags
+        uint8, bits of :class:`tofcapture.flags.TofFlag`; 0 is a good pixel.
+    """
+
+    depth: Float32
+    confidence: Float32
+    flags: NDArray[np.uint8]
+
+
+class Decoder:
+    """Decodes raw frames of one camera.
+
+    Parameters
+    ----------
+    info
+        Channels, intrinsics, light source, saturation and range errors.
+    noise
+        Of one tap; decides which pixels are of low confidence.
+    min_amplitude
+        Pixels whose weaker amplitude is not above it have no depth; raw units.
+
+    Raises
+    ------
+    DataError
+        When there are not exactly two frequencies in a whole ratio, or phases that determine no phasor.
+    """
+
+    def __init__(self, info: TofInfo, noise: TapNoise | None = None, min_amplitude: float = 0.0) -> None:
+        hz = frequencies(info.modulation_hz)
+        if len(hz) != 2:
+            raise DataError(f"decode: expected two frequencies, got {[f / 1e6 for f in hz]} MHz")
+        self.info, self.noise = info, noise or TapNoise()
+        self._rows = tap_weights(info)
+        by_hz = {e.modulation_hz: e for e in info.range_errors}
+        self._corrections = [Correction(by_hz.get(f, RangeError(f)), info.camera) for f in hz]
+        self._R = ambiguity(hz[0]), ambiguity(hz[1])
+        whole_ratio(*self._R)
+        # Fusion leans on the high frequency by f^2: inverse variance at equal phase noise.
+        self._lean = self._R[1] * hz[1] ** 2 / (hz[0] ** 2 + hz[1] ** 2)
+        self._min_power = float(np.square(min_amplitude))
+        self._dim = self._R[1] ** 2 / (8 * np.pi**2 * _UNCERTAIN**2)
+        self._geometry()
+        size = min(_BLOCK, info.camera.width * info.camera.height)
+        # In-phase, quadrature, amplitude and scratch of both frequencies, and the mean tap of the high one.
+        self._buffers = np.empty((4, 2, size), np.float32), np.empty(size, np.float32)
+        self._scratch = np.empty((2, info.camera.width * info.camera.height), np.float32)
+        self._indices = np.empty(size, np.int32), np.empty(size, np.int64)
+        self._dark = np.array([[c.dark] for c in self._corrections], np.float32)
+        self._darkness = np.zeros((2, size if self._dark.any() else 0), np.float32)
+
+    def _geometry(self) -> None:
+        """Tables of ``z = (D^2 - |s|^2 / 4) / (D L - r . s / 2)``, r the ray with z = 1 and L its length."""
+        camera, s = self.info.camera, np.asarray(self.info.illuminator, dtype=np.float64)
+        self._length = camera.ray_lengths.ravel().astype(np.float32)
+        self._slant = (camera.rays @ s / 2).ravel().astype(np.float32)
+        self._quarter, self._nearest = float(s @ s / 4), float(np.sqrt(s @ s) / 2)
+
+    def __call__(
+        self, raw: NDArray[Any], celsius: float = float("nan"), out: DepthMaps | None = None
+    ) -> DepthMaps:
+        """Decode one frame.
+
+        Parameters
+        ----------
+        raw
+            (K, H, W) taps, any real dtype.
+        celsius
+            Sensor temperature; NaN: unknown.
+        out
+            What an earlier call returned, to be overwritten; ``None``: new arrays.
+
+        Returns
+        -------
+        DepthMaps
+
+        Raises
+        ------
+        DataError
+            When ``raw`` is of another shape.
+        """
+        self._expect(raw.shape)
+        return self._decode(raw, celsius, 1, self._saturated(raw.max(axis=0)), out)
+
+    def burst(self, raw: NDArray[Any], celsius: float = float("nan")) -> DepthMaps:
+        """Decode a burst (frames, K, H, W), averaged as I and Q; a pixel is saturated when it is in any frame."""
+        self._expect(raw.shape[1:])
+        mean = raw.mean(axis=0, dtype=np.float64)
+        return self._decode(mean, celsius, len(raw), self._saturated(raw.max(axis=(0, 1))))
+
+    def _saturated(self, largest: NDArray[Any]) -> NDArray[np.bool_]:
+        # Integers are compared with an integer: not one of them is converted.
+        limit = self.info.saturation if largest.dtype.kind == "f" else math.ceil(self.info.saturation)
+        out: NDArray[np.bool_] = np.asarray(largest >= limit)
+        return out
+
+    def _expect(self, shape: tuple[int, ...]) -> None:
+        expected = (len(self.info.modulation_hz), *self.info.camera.shape)
+        if shape != expected:
+            raise DataError(f"decode: expected raw of shape {expected}, got {shape}")
+
+    def _decode(
+        self,
+        raw: NDArray[Any],
+        celsius: float,
+        frames: int,
+        saturated: NDArray[np.bool_],
+        out: DepthMaps | None = None,
+    ) -> DepthMaps:
+        camera = self.info.camera
+        celsius = celsius if np.isfinite(celsius) else _UNKNOWN_CELSIUS
+        flat = np.ascontiguousarray(raw).reshape(len(raw), -1)
+        n = flat.shape[1]
+        out = out or _empty_maps(camera.shape)
+        depth, confidence, flags = out.depth.reshape(-1), out.confidence.reshape(-1), out.flags.reshape(-1)
+        bad = np.empty(n, bool)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            for at in _blocks(n):
+                phases = self._phases(flat[:, at], frames, confidence[at], flags[at], bad[at])
+                self._ranges(phases, at, celsius, flags[at])
+                self._depth(phases, at, depth[at], bad[at])
+        image, bits = out.depth, out.flags
+        bits |= saturated
+        np.copyto(image, np.nan, where=bad.reshape(camera.shape) | saturated)
+        bits |= flying_pixels(image, camera, self._scratch).view(np.uint8) * np.uint8(TofFlag.FLYING)
+        return out
+
+    def _phases(
+        self,
+        raw: NDArray[Any],
+        frames: int,
+        confidence: Float32,
+        flags: NDArray[np.uint8],
+        bad: NDArray[np.bool_],
+    ) -> tuple[Float32, Float32]:
+        """Phases of both frequencies in turns, [0, 1), and scratch; amplitude and what it decides on the way."""
+        n = raw.shape[1]
+        real, imag, size, work = self._buffers[0][..., :n]
+        limit = self._buffers[1][:n]
+        for terms, out in zip(self._rows, (*real, *imag, limit), strict=True):
+            combine(raw, terms, out, work[0])
+        # Low confidence: power below what this tap noise needs for a range that is certain to _UNCERTAIN.
+        limit *= self._dim / (frames * self.noise.electrons_per_unit)
+        limit += self._dim / frames * self.noise.read**2
+        np.multiply(real, real, out=size)
+        np.multiply(imag, imag, out=work)
+        size += work
+        np.multiply((limit > size[1]).view(np.uint8), np.uint8(TofFlag.LOW_CONFIDENCE), out=flags)
+        np.less_equal(np.minimum(size[0], size[1], out=work[0]), self._min_power, out=bad)
+        np.sqrt(size, out=size)
+        np.copyto(confidence, size[1])
+        if self._darkness.size:
+            np.divide(self._dark, size, out=self._darkness[:, :n])
+        turns_of(real, imag, size, work)
+        return size, work
+
+    def _ranges(
+        self, phases: tuple[Float32, Float32], at: slice, celsius: float, flags: NDArray[np.uint8]
+    ) -> None:
+        """Ranges without their systematic errors, the high one unwrapped, both fused; the result lies in the low one."""
+        (low, high), (gap, work) = phases
+        indices = [index[: low.size] for index in self._indices]
+        for correct, range_, dark in zip(self._corrections, (low, high), self._darkness, strict=True):
+            correct(range_, at, celsius, work, indices, dark[: low.size])
+        np.subtract(low, high, out=gap)
+        gap *= 1 / self._R[1]
+        gap -= np.rint(gap, out=work)
+        np.abs(gap, out=work)
+        flags |= (work > _AMBIGUOUS).view(np.uint8) * np.uint8(TofFlag.AMBIGUOUS)
+        gap *= self._lean
+        low -= gap
+        np.multiply(low, 1 / self._R[0], out=work)
+        np.floor(work, out=work)
+        work *= self._R[0]
+        low -= work
+
+    def _depth(
+        self, phases: tuple[Float32, Float32], at: slice, depth: Float32, bad: NDArray[np.bool_]
+    ) -> None:
+        (range_, _), (work, _) = phases
+        bad |= range_ <= self._nearest
+        np.multiply(range_, range_, out=work)
+        work -= self._quarter
+        range_ *= self._length[at]
+        range_ -= self._slant[at]
+        np.divide(work, range_, out=depth)
+
+
+def _empty_maps(shape: tuple[int, int]) -> DepthMaps:
+    return DepthMaps(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
+
+
+def _blocks(n: int) -> Iterator[slice]:
+    return (slice(i, min(i + _BLOCK, n)) for i in range(0, n, _BLOCK))

@@ -1,0 +1,179 @@
+"""Augmentations that a sensor could have seen, on raw taps, on whatever device the tensors are.
+
+Noise and light change taps before they are decoded; flips and crops change what the camera is. Each keeps frame, ground truth,
+intrinsics and light source consistent: decoding what comes out gives what decoding would have given, changed the same way.
+
+::
+
+    item = RawItem(raw, depth, normals, mask, intrinsics, illuminator)
+    item = flip(item, axis=-1)
+    item = item._replace(raw=scale_albedo(item.raw, 0.6, ambient=20.0, generator=generator))
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tofcapture.errors import ConfigError
+from tofcapture.ops.phase import TapNoise
+
+FULL_SCALE = 4095.0  # raw units where a 12-bit sensor saturates
+
+
+class RawItem(NamedTuple):
+    """A raw frame with all that its geometry depends on; any leading batch axes, the same for all.
+
+    Attributes
+    ----------
+    raw
+        (..., K, H, W) taps, raw units.
+    depth
+        (..., 2H, 2W) ground truth, metres; NaN: not hit.
+    normals
+        (..., 2H, 2W, 3), unit, facing the camera; NaN: not hit.
+    mask
+        (..., 2H, 2W) uint8, bits of :class:`tofcapture.files.layout.MaskBit`.
+    intrinsics
+        (..., 4) fx, fy, cx, cy in pixels of the (H, W) grid.
+    illuminator
+        (..., 3) light source in the ToF frame, metres.
+    """
+
+    raw: Tensor
+    depth: Tensor
+    normals: Tensor
+    mask: Tensor
+    intrinsics: Tensor
+    illuminator: Tensor
+
+
+def flip(item: RawItem, axis: int = -1) -> RawItem:
+    """Mirror left and right (axis -1) or up and down (axis -2): the world, and with it the camera and its lamp.
+
+    The principal point, that component of the normals and of the light source change with the images; the taps' phases do not.
+    """
+    if axis not in (-1, -2):
+        raise ConfigError(f"flip: expected the axis -1 or -2, got {axis}")
+    component = -1 - axis  # x for columns, y for rows
+    intrinsics, light, normals = (x.clone() for x in (item.intrinsics, item.illuminator, item.normals))
+    intrinsics[..., 2 + component] = item.raw.shape[axis] - 1 - intrinsics[..., 2 + component]
+    light[..., component] *= -1
+    normals[..., component] *= -1
+    return RawItem(
+        item.raw.flip(axis),
+        item.depth.flip(axis),
+        normals.flip(axis - 1),
+        item.mask.flip(axis),
+        intrinsics,
+        light,
+    )
+
+
+def crop(item: RawItem, top: int, left: int, size: tuple[int, int]) -> RawItem:
+    """Cut a window (height, width) at (top, left), pixels of the (H, W) grid; the principal point moves with it."""
+    H, W = item.raw.shape[-2:]
+    if not (0 <= top <= top + size[0] <= H and 0 <= left <= left + size[1] <= W and min(size) > 0):
+        raise ConfigError(f"crop: expected a window inside {(H, W)}, got {size} at {(top, left)}")
+    rows, cols = slice(top, top + size[0]), slice(left, left + size[1])
+    fine = (..., slice(2 * rows.start, 2 * rows.stop), slice(2 * cols.start, 2 * cols.stop))
+    shift = torch.tensor([0.0, 0.0, left, top]).to(item.intrinsics)
+    return RawItem(
+        item.raw[..., rows, cols],
+        item.depth[fine],
+        item.normals[(*fine, slice(None))],
+        item.mask[fine],
+        item.intrinsics - shift,
+        item.illuminator,
+    )
+
+
+def scale_albedo(
+    raw: Tensor,
+    factor: Tensor | float,
+    ambient: float,
+    generator: torch.Generator,
+    *,
+    averaged: float = 1.0,
+    noise: TapNoise | None = None,
+    full_scale: float = FULL_SCALE,
+) -> Tensor:
+    """Taps as a sensor would have given them of a world whose surfaces return ``factor`` times the light.
+
+    The signal is scaled and the ambient level kept. Of the noise that such taps have (``tap / gain + read^2``), the scaled ones
+    bring a part along, ``factor^2 / averaged`` of theirs; the rest is drawn. Then taps are rounded and clipped. What was
+    saturated stays so: how bright it was is not known. Light between surfaces, which goes with the product of their albedos,
+    scales like the direct one here: keep factors near 1 where multipath matters.
+
+    Parameters
+    ----------
+    raw
+        (..., K, H, W), one frame or the mean of ``averaged`` frames; integers or floats, raw units.
+    factor
+        Positive, broadcastable to ``raw``.
+    ambient
+        Part of a tap that is not the lamp's light, raw units.
+    generator
+        Of the device that ``raw`` is on.
+    averaged
+        Frames that ``raw`` is the mean of; ``inf`` for taps without noise.
+    noise
+        Of one tap of one frame.
+    full_scale
+        Raw value of saturation.
+
+    Returns
+    -------
+    float32 of whole numbers, like one frame, shaped like ``raw``.
+
+    Raises
+    ------
+    ConfigError
+        When the scaled taps would be noisier than a frame may be: ``factor^2 > averaged`` for a factor above 1.
+    """
+    noise = noise or TapNoise()
+    taps = raw.to(torch.float32)
+    scale = torch.as_tensor(factor, dtype=torch.float32, device=taps.device)
+    if not bool((scale > 0).all()) or bool(((scale > 1) & (scale**2 > averaged)).any()):
+        raise ConfigError(
+            f"scale_albedo: expected positive factors up to {max(averaged, 1.0) ** 0.5:g}, got up to {scale.max():g}",
+            hint="a single frame can be made darker only; the mean of a burst brighter, too",
+        )
+    brighter = ambient + scale * (taps - ambient)
+    wanted = _variance(brighter, noise)
+    brought = scale**2 * _variance(taps, noise) / averaged
+    drawn = torch.randn(taps.shape, generator=generator, device=taps.device)
+    out = (brighter + drawn * (wanted - brought).clamp(min=0).sqrt()).round().clamp(0, full_scale)
+    return torch.where(taps >= full_scale, full_scale, out)
+
+
+def _variance(taps: Tensor, noise: TapNoise) -> Tensor:
+    return taps.clamp(min=0) / noise.electrons_per_unit + noise.read**2
+
+
+def redraw_noise(
+    taps: Tensor,
+    generator: torch.Generator,
+    *,
+    averaged: float = float("inf"),
+    noise: TapNoise | None = None,
+    full_scale: float = FULL_SCALE,
+) -> Tensor:
+    """One more frame of a static burst: shot and read noise drawn on the taps from their own values.
+
+    Parameters
+    ----------
+    taps
+        (..., K, H, W), the mean of ``averaged`` frames, raw units; with all of a burst the noise is that of one frame, exactly.
+    generator
+        Of the device that ``taps`` are on.
+    averaged, noise, full_scale
+        As for :func:`scale_albedo`.
+
+    Returns
+    -------
+    float32 of whole numbers, shaped like ``taps``.
+    """
+    return scale_albedo(taps, 1.0, 0.0, generator, averaged=averaged, noise=noise, full_scale=full_scale)
