@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
-from tofcapture.ops.crop import dominant_plane, find_crop, inside
-from tofcapture.ops.denoise import denoise
+from tofcapture.ops.crop import Crop, crop_depth, dominant_plane, find_crop, inside
+from tofcapture.ops.denoise import SPIKE_PIXELS, SPIKE_SIGMAS, STEEPEST, SUPPORT, denoise
 from tofcapture.ops.register import register
 from tofcapture.poses import exp, transform_points
 
@@ -76,6 +76,54 @@ def test_denoise_removes_veils_spikes_and_speckles():
     assert keep[45:85, 56:104].mean() > 0.99
     assert keep[41:89, 52].mean() > 0.9
     assert keep[110:125, 20:140].mean() > 0.99
+
+
+def test_denoise_is_what_numpy_says():
+    """On a noisy step with holes the compiled window keeps the points that a plain numpy version of the two rules keeps."""
+    depth = np.where(np.arange(CAMERA.width) < 80, 0.7, 0.72) * np.ones(CAMERA.shape)
+    depth *= 1 + 3e-3 * rng().standard_normal(CAMERA.shape)
+    depth[rng().random(CAMERA.shape) < 0.2] = np.nan
+    z = np.pad(depth.astype(np.float32), 2, constant_values=np.nan)
+    centre, inverse = z[2:-2, 2:-2], 1 / z
+    support, pairs, total = (np.zeros(CAMERA.shape) for _ in range(3))
+    limit = STEEPEST / 144 * centre
+    for dv, du in [(0, 1), (0, 2), *((v, u) for v in (1, 2) for u in range(-2, 3))]:
+        ahead, behind = ((slice(2 + s * dv, 130 + s * dv), slice(2 + s * du, 162 + s * du)) for s in (1, -1))
+        near = [np.abs(z[at] - centre) <= limit * np.hypot(dv, du) for at in (ahead, behind)]
+        support += near[0].astype(int) + near[1]
+        pairs += near[0] & near[1]
+        total += np.where(near[0] & near[1], inverse[ahead] + inverse[behind], 0)
+    deviation = np.where(pairs > 0, np.abs(total / (2 * np.maximum(pairs, 1)) * centre - 1), 0)
+    enough = support >= SUPPORT
+    sigma = 1.4826 * np.median((deviation / centre)[enough])
+    expected = enough & (deviation <= np.maximum(SPIKE_SIGMAS * sigma * centre, SPIKE_PIXELS / 144))
+    assert 100 < expected.sum() < np.isfinite(depth).sum()
+    assert np.isfinite(depth)[expected].all()
+    assert (denoise(depth, CAMERA) == expected).mean() > 0.999  # the noise is told from every seventh point
+
+
+def test_an_inclined_plate_that_fills_the_view_is_not_the_table():
+    """Of a plate tilted by 20 degrees and a strip of table the strip is the table; without a strip all is kept."""
+    generator = rng()
+    plate = generator.uniform([-0.3, -0.3, 0], [0.3, 0.3, 0], (9000, 3))
+    plate[:, 2] = 0.8 - np.tan(np.radians(20)) * plate[:, 0]
+    strip = generator.uniform([0.3, -0.3, 1.0], [0.4, 0.3, 1.0], (1000, 3))
+    assert find_crop(np.concatenate([plate, strip]), UP, rng()).offset == pytest.approx(-1.0, abs=1e-6)
+    assert np.isnan(find_crop(plate, UP, rng()).offset)
+
+
+def test_crop_of_another_camera_is_the_same_rule():
+    """Depth of a camera elsewhere is kept exactly where its points are inside."""
+    T = exp([0.05, -0.02, 0.01, 0.1, -0.05, 0.02])
+    depth = (0.8 + 0.1 * rng().random(CAMERA.shape)).astype(np.float32)
+    depth[5, 6] = np.nan
+    points = transform_points(T, CAMERA.unproject(depth))
+    crop = find_crop(points, UP, rng(), radius=0.2)
+    flat = Crop(np.array([0.0, 0.0, -1.0]), -0.9, np.array([0, 0, 0.9]), 0.2, 0.001, 2.0)
+    for c in (crop, flat):
+        kept = crop_depth(c, depth, CAMERA, T)
+        np.testing.assert_array_equal(np.isfinite(kept), inside(c, points))
+        np.testing.assert_array_equal(kept[np.isfinite(kept)], depth[np.isfinite(kept)])
 
 
 def test_denoise_of_nothing_is_nothing():
@@ -152,7 +200,7 @@ def test_without_a_table_everything_within_range_stays():
 
 def test_the_same_generator_gives_the_same_crop():
     """The plane search is a function of points and generator."""
-    points = CAMERA.unproject(tilted() + 0.001 * rng().standard_normal(CAMERA.shape))
+    points = CAMERA.unproject(tilted(0.1) + 0.001 * rng().standard_normal(CAMERA.shape))
     first, second = find_crop(points, UP, rng()), find_crop(points, UP, rng())
     np.testing.assert_array_equal(first.normal, second.normal)
     assert first.offset == second.offset

@@ -50,9 +50,7 @@ def seen_by_both(depth, camera, baseline, T_camera_world, walls):
 
 
 def render(depth, scale=1, camera=TOF):
-    sheet = triangulate(depth, STEREO)
-    points = transform_points(T, STEREO.unproject(sheet.depth))
-    return project(sheet, points, camera.scaled(scale), edge_pixels=scale)
+    return project(triangulate(depth, STEREO), STEREO, T, camera.scaled(scale), edge_pixels=scale)
 
 
 BACK = (1.0, -9, 9, -9, 9)
@@ -68,14 +66,14 @@ def test_a_plane_is_exact_at_pixel_centres(a, b, distance):
     n_tof = T[:3, :3] @ normal
     offset = -distance + n_tof @ T[:3, 3]
     for camera in (TOF, TOF.scaled(2), Camera(17, 23, 20.0, 21.0, 8.1, 11.3)):
-        found = project(
-            triangulate(depth, STEREO), transform_points(T, STEREO.unproject(depth)), camera, edge_pixels=1
-        )
+        found = project(triangulate(depth, STEREO), STEREO, T, camera, edge_pixels=1)
         hit = np.isfinite(found.depth)
         assert hit.mean() > 0.5
         np.testing.assert_allclose(found.depth[hit], (offset / (camera.rays @ n_tof))[hit], atol=1e-9)
         assert np.abs(found.normals[hit] - n_tof).max() < 1e-6
-        assert not found.occluded.any()
+        assert (
+            hit & ~found.occluded
+        ).mean() > 0.1  # rays from aside cross what the stereo camera does not see
 
 
 def test_the_hit_is_where_the_stereo_camera_sees_it():
@@ -158,7 +156,7 @@ def test_the_back_of_a_sheet_is_no_surface():
     depth = planes(STEREO, np.eye(4), [BACK])
     behind = exp([0, 0, 0, 0, np.pi, 0]) @ exp([0, 0, -2.0, 0, 0, 0])
     sheet = triangulate(depth, STEREO)
-    found = project(sheet, transform_points(behind, STEREO.unproject(sheet.depth)), TOF, 1)
+    found = project(sheet, STEREO, behind, TOF, 1)
     assert np.isnan(found.depth).all()
     assert found.occluded.any()
 
@@ -177,10 +175,35 @@ def test_open3d_agrees():
     camera = TOF.scaled(2)
     rays = np.concatenate([np.zeros_like(camera.rays), camera.rays], axis=-1).astype(np.float32)
     expected = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
-    found = project(triangulate(depth, STEREO), points, camera, 2).depth
+    found = project(triangulate(depth, STEREO), STEREO, T, camera, 2).depth
     both = np.isfinite(expected) & np.isfinite(found)
     assert (np.isfinite(expected) == np.isfinite(found)).mean() > 0.999
     np.testing.assert_allclose(found[both], expected[both], atol=2e-6)
+
+
+def test_what_stands_beside_the_stereo_image_hides_what_is_behind_it():
+    """A rod before a wall, in the ToF camera's view and outside the stereo camera's: the wall behind it is marked as hidden.
+
+    Nothing of the rod is measured; that there are things as near as it is tells a second one, in both views.
+    """
+    wide = Camera(48, 36, 18.6, 20.1, 23.5, 17.2)
+    rods = [(0.4, -0.02, 0.02, -0.1, 0.1), (0.4, -9, 9, -0.22, -0.19)]
+    assert np.isnan(planes(STEREO, np.eye(4), rods[1:])).all()
+    found = render(
+        seen_by_both(planes(STEREO, np.eye(4), [*rods, BACK]), STEREO, 0.1, np.eye(4), rods), 2, wide
+    )
+    truth = planes(wide.scaled(2), T, [*rods, BACK])
+    wrong = found.depth - truth > 1e-3
+    assert wrong.any()
+    assert (found.occluded | found.edge)[wrong].all()
+    assert found.occluded[wrong].mean() > 0.5
+
+
+def test_what_is_far_is_no_surface():
+    """Points deeper than the limit, in the ToF frame, are not hit."""
+    depth = planes(STEREO, np.eye(4), [FRONT, BACK])
+    found = project(triangulate(depth, STEREO), STEREO, T, TOF.scaled(2), 1, far=0.85)
+    assert 0 < np.nanmax(found.depth) < 0.85
 
 
 def test_nothing_measured_projects_to_nothing():

@@ -34,24 +34,42 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--far", type=float, metavar="M", help="deepest ground truth, metres (default: 2.0)")
     parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core, at most 4)")
+    parser.add_argument(
+        "--engine", choices=("process", "dask"), default="process", help="who builds (default: process)"
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a Dask cluster, for example tcp://host:8786"
+    )
+    share = parser.add_mutually_exclusive_group()
+    share.add_argument(
+        "--shard",
+        metavar="I/N",
+        help="build only part I of N of the scenes; the last part to be done finishes the dataset",
+    )
+    share.add_argument(
+        "--finish",
+        action="store_true",
+        help="build nothing, write manifest and card of the shards that are there",
+    )
 
 
 class _Lines:
-    """Plain lines of progress with an ETA, now and then; on a terminal the line is rewritten after each view."""
+    """Plain lines of progress with an ETA, now and then; on a terminal the line is rewritten each time."""
 
     def __init__(self, total: int) -> None:
-        self._total, self._done = total, 0
+        self._total, self._done = total, dict[str, int]()
         self._start = self._last = time.monotonic()
 
     def __call__(self, scene: str, done: int, views: int) -> None:
-        self._done += 1
+        self._done[scene] = done
         now = time.monotonic()
         if not (sys.stderr.isatty() or now - self._last > _EVERY):
             return
         self._last = now
-        eta = (now - self._start) / self._done * max(0, self._total - self._done)
+        views_done = sum(self._done.values())
+        eta = (now - self._start) / max(1, views_done) * max(0, self._total - views_done)
         end = "\r" if sys.stderr.isatty() and done < views else "\n"
-        line = f"{scene}: view {done} of {views}, {self._done} of {self._total} in all, ETA {eta:.0f} s"
+        line = f"{scene}: view {done} of {views}, {views_done} of {self._total} in all, ETA {eta:.0f} s"
         print(f"{line:<78}", end=end, file=sys.stderr, flush=True)
 
 
@@ -64,7 +82,7 @@ def _positive(value: float | None, name: str) -> dict[str, Any]:
 
 
 def _run(args: argparse.Namespace) -> Outcome:
-    from tofcapture.dataset.build import build_dataset
+    from tofcapture.dataset.build import Share, build_dataset
     from tofcapture.dataset.recordings import find_scenes
     from tofcapture.dataset.sample import SampleConfig
 
@@ -80,11 +98,15 @@ def _run(args: argparse.Namespace) -> Outcome:
         config=config,
         jobs=args.jobs,
         progress=_Lines(total),
+        engine=args.engine,
+        scheduler=args.scheduler,
+        share=None if args.shard is None else Share.parse(args.shard),
+        finish=args.finish,
     )
-    return _outcome(result, time.monotonic() - start)
+    return _outcome(result, time.monotonic() - start, complete=args.shard is None)
 
 
-def _outcome(result: BuildResult, seconds: float) -> Outcome:
+def _outcome(result: BuildResult, seconds: float, *, complete: bool) -> Outcome:
     views = sum(e.views for e in result.scenes.values())
     data = {
         "dataset": str(result.dataset),
@@ -94,16 +116,22 @@ def _outcome(result: BuildResult, seconds: float) -> Outcome:
         "splits": {name: entry.split for name, entry in sorted(result.scenes.items())},
         "gt": None if result.gt is None else result.gt.table(),
         "failures": {scene: {"message": e.message, "hint": e.hint} for scene, e in result.failures.items()},
+        "missing": list(result.missing),
+        "peak_memory_bytes": result.peak_memory,
         "seconds": round(seconds, 2),
     }
-    return Outcome(data, _text(result, views, seconds), exit_code=5 if result.failures else 0)
+    bad = result.failures or (complete and result.missing)
+    return Outcome(data, _text(result, views, seconds), exit_code=5 if bad else 0)
 
 
 def _text(result: BuildResult, views: int, seconds: float) -> str:
     lines = [
         f"{name:<24} {entry.split:<6} {entry.views:>3} views" for name, entry in sorted(result.scenes.items())
     ]
-    lines.append(f"{result.dataset}: {len(result.scenes)} scenes, {views} views in {seconds:.1f} s")
+    lines.append(
+        f"{result.dataset}: {len(result.scenes)} scenes, {views} views in {seconds:.1f} s, "
+        f"at most {result.peak_memory / 2**30:.2f} GiB a process"
+    )
     if result.skipped:
         lines.append(f"{len(result.skipped)} scenes were already built")
     if result.gt is not None:
@@ -111,6 +139,10 @@ def _text(result: BuildResult, views: int, seconds: float) -> str:
         lines.append(
             f"ground truth against the simulator: median {gt.median_error_mm:.2f} mm, "
             f"99 % {gt.p99_error_mm:.2f} mm, covers {gt.coverage:.0%} of the object"
+        )
+    if result.missing:
+        lines.append(
+            f"{len(result.missing)} scenes are not there yet: {', '.join(result.missing[:5])}; no manifest is written"
         )
     lines += [f"FAILED {scene}: {error.message}" for scene, error in result.failures.items()]
     return "\n".join(lines)

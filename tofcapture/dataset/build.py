@@ -6,61 +6,23 @@ skips shards whose digest is right, so a run that was killed goes on where it wa
 
 from __future__ import annotations
 
-import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
-from multiprocessing import get_context
 from pathlib import Path
 
-import numpy as np
-
-from tofcapture import __version__
 from tofcapture.dataset.card import write_card
+from tofcapture.dataset.engines import Progress, run
 from tofcapture.dataset.recordings import find_scenes, rig_for
-from tofcapture.dataset.sample import SampleConfig, calibrated, make_sample
+from tofcapture.dataset.sample import SampleConfig
+from tofcapture.dataset.shard_task import WORK, SceneOutcome, SceneTask, look, versions
 from tofcapture.dataset.split import assign_splits
-from tofcapture.dataset.truth import TruthError, ViewError, pool, pooled_error, view_error
-from tofcapture.errors import TofError
-from tofcapture.files.hdf import dumps
-from tofcapture.files.layout import SHARD
+from tofcapture.dataset.truth import TruthError, pooled_error
+from tofcapture.errors import ConfigError, TofError
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
-from tofcapture.files.seal import PARTIAL, sealed_digest
-from tofcapture.files.shard import Sample, ShardReader
-from tofcapture.files.shard_writer import ShardWriter
-from tofcapture.files.view import read_view
-from tofcapture.rig import Rig, dumps_rig
-
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, views finished, views in all."""
-
-
-@dataclass(frozen=True)
-class SceneJob:
-    """What one shard is made of: scene, view files in order, rig, config, digest of each view file."""
-
-    scene: str
-    views: tuple[Path, ...]
-    rig: Rig
-    config: SampleConfig
-    inputs: tuple[str, ...]
-
-    @property
-    def digest(self) -> str:
-        """Digest of everything that the shard's bytes depend on."""
-        parts = {
-            "scene": self.scene,
-            "inputs": self.inputs,
-            "rig": dumps_rig(self.rig),
-            "config": asdict(self.config),
-            "layout": [SHARD.format, SHARD.version],
-            "versions": versions(),
-        }
-        return hashlib.sha256(dumps(parts).encode()).hexdigest()
+from tofcapture.files.seal import PARTIAL
 
 
 @dataclass(frozen=True)
@@ -77,126 +39,69 @@ class BuildResult:
         Scenes whose shard was already right.
     failures
         Error by scene that has no shard.
+    missing
+        Scenes that are other calls' to build and are not there yet; then there is no manifest either.
     gt
-        Error of the ground truth, pooled over all views; ``None`` when no view carries truth.
+        Error of the ground truth, pooled over all views; ``None`` when no view carries truth, or scenes are missing.
+    peak_memory
+        Largest resident size of a process that made a shard, bytes.
     """
 
     dataset: Path
     scenes: Mapping[str, SceneEntry]
     skipped: tuple[str, ...]
     failures: Mapping[str, TofError]
+    missing: tuple[str, ...]
     gt: TruthError | None
+    peak_memory: int
 
 
-def versions() -> dict[str, str]:
-    """Versions that a shard's bytes depend on."""
-    out = {"tofcapture": __version__}
-    for name in ("numpy", "h5py"):
-        try:
-            out[name] = version(name)
-        except PackageNotFoundError:  # pragma: no cover  vendored
-            out[name] = "unknown"
-    return out
+@dataclass(frozen=True)
+class Share:
+    """The part of a build that one call of a batch system does: ``index`` of ``count``, from 1."""
+
+    index: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> Share:
+        """Read ``2/8``; :class:`ConfigError` for anything else."""
+        index, _, count = text.partition("/")
+        if not (index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count)):
+            raise ConfigError(f"--shard: expected I/N with 1 <= I <= N, got {text!r}", hint="--shard 2/8")
+        return cls(int(index), int(count))
 
 
-def sample_of(path: Path, rig: Rig, config: SampleConfig) -> tuple[Sample, ViewError | None]:
-    """Read a view and make its sample, with its error where the truth is known."""
-    view = read_view(path)
-    sample = make_sample(view, rig, config, np.random.default_rng(view.index))
-    return sample, view_error(sample, view)
+def default_jobs() -> int:
+    """One process for each core that this one may use, at most four."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(4, cores)
 
 
-@contextmanager
-def _workers(jobs: int) -> Iterator[Executor | None]:
-    if jobs <= 1:
-        yield None
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool_:
-        yield pool_
-
-
-def _samples(job: SceneJob, workers: Executor | None) -> Iterator[tuple[Sample, ViewError | None]]:
-    if workers is None:
-        yield from (sample_of(path, job.rig, job.config) for path in job.views)
-        return
-    futures = [workers.submit(sample_of, path, job.rig, job.config) for path in job.views]
-    try:
-        while futures:
-            yield futures.pop(0).result()
-    except BrokenProcessPool as err:
-        raise TofError(
-            f"{job.scene}: a worker process died", hint="run again; out of memory: --jobs 1"
-        ) from err
-    finally:
-        for future in futures:
-            future.cancel()
-
-
-def build_shard(
-    job: SceneJob, path: Path, workers: Executor | None = None, progress: Progress | None = None
-) -> tuple[str, TruthError | None]:
-    """Write one shard.
-
-    Parameters
-    ----------
-    job
-        What it is made of.
-    path
-        Of the shard.
-    workers
-        Makes samples in parallel; ``None``: here.
-    progress
-        Told after each view.
-
-    Returns
-    -------
-    SHA-256 of the shard, and the ground truth's error where it is known.
-
-    Raises
-    ------
-    DataError
-        A view is damaged or is of another camera than the rig; nothing is left behind.
-    """
-    first = read_view(job.views[0])
-    info = calibrated(first.tof.info, job.rig)
-    errors: list[ViewError] = []
-    good: list[int] = []
-    with ShardWriter(path, job.scene, job.rig, info, first.stereo.info, len(job.views)) as shard:
-        for done, (sample, error) in enumerate(_samples(job, workers), start=1):
-            shard.add(sample)
-            good.append(int((sample.ground_truth[2].mask == 0).sum()))
-            errors += [] if error is None else [error]
-            if progress:
-                progress(job.scene, done, len(job.views))
-        gt = pool(errors) if errors else None
-        provenance = {
-            "digest": job.digest,
-            "config": asdict(job.config),
-            "versions": versions(),
-            "views": [
-                {"name": path.name, "sha256": digest, "good_pixels": pixels}
-                for path, digest, pixels in zip(job.views, job.inputs, good, strict=True)
-            ],
-            "gt": None if gt is None else gt.table(),
-        }
-        return shard.seal(provenance), gt
-
-
-def finished(job: SceneJob, path: Path) -> str | None:
-    """Digest of a shard that is already what the job would make; ``None`` when it has to be built."""
-    if not path.is_file():
-        return None
-    try:
-        with ShardReader(path) as shard:
-            same = shard.provenance.get("digest") == job.digest
-        return sealed_digest(path) if same else None
-    except TofError:
-        return None
-
-
-def _job(scene: str, found: tuple[Path, tuple[Path, ...]], rig: Rig, config: SampleConfig) -> SceneJob:
-    _, views = found
-    return SceneJob(scene, views, rig, config, tuple(sealed_digest(p) for p in views))
+def scene_tasks(
+    recordings: Sequence[Path],
+    out: Path,
+    rig_path: Path | None = None,
+    *,
+    true_rig: bool = False,
+    config: SampleConfig | None = None,
+) -> list[SceneTask]:
+    """One task for each scene, sorted by name; paths are absolute, for workers elsewhere. As for :func:`build_dataset`."""
+    config = config or SampleConfig()
+    out = Path(out).absolute()
+    found = find_scenes([Path(r).absolute() for r in recordings])
+    return [
+        SceneTask(
+            scene,
+            views,
+            rig_for(
+                recording, views[0], None if rig_path is None else rig_path.absolute(), true_rig=true_rig
+            ),
+            config,
+            out / "shards" / f"{scene}.h5",
+        )
+        for scene, (recording, views) in sorted(found.items())
+    ]
 
 
 def build_dataset(
@@ -208,6 +113,10 @@ def build_dataset(
     config: SampleConfig | None = None,
     jobs: int | None = None,
     progress: Progress | None = None,
+    engine: str = "process",
+    scheduler: str | None = None,
+    share: Share | None = None,
+    finish: bool = False,
 ) -> BuildResult:
     """Build or complete a dataset.
 
@@ -224,9 +133,15 @@ def build_dataset(
     config
         Constants of the ground truth.
     jobs
-        Processes; by default one per core, at most four; each takes 0.6 GB.
+        Processes; by default one per core, at most four; each takes half a gigabyte.
     progress
-        Told after each view.
+        Told after each view, or each scene.
+    engine, scheduler
+        ``process``, or ``dask`` with the address of a scheduler.
+    share
+        Build only this part of the scenes; the call that finds all shards in place finishes the dataset.
+    finish
+        Build nothing, finish the dataset from the shards that are there.
 
     Returns
     -------
@@ -236,50 +151,70 @@ def build_dataset(
     Raises
     ------
     ConfigError
-        No rig, or a scene that is in two recordings.
+        No rig, a scene that is in two recordings, or an engine that is not there.
     DataError
         No scenes.
     """
     config = config or SampleConfig()
-    found = find_scenes([Path(r) for r in recordings])
-    rigs = {
-        scene: rig_for(rec, views[0], rig_path, true_rig=true_rig) for scene, (rec, views) in found.items()
-    }
+    out = Path(out)
+    tasks = scene_tasks(recordings, out, rig_path, true_rig=true_rig, config=config)
+    mine = [] if finish else tasks[share.index - 1 :: share.count] if share else tasks
+    outcomes = dict(run(mine, engine, default_jobs() if jobs is None else jobs, scheduler, progress))
+    others = [t for t in tasks if t.scene not in outcomes]
+    if finish or all(t.path.is_file() for t in others):
+        outcomes |= {t.scene: look(t) for t in others}
+    return _result(out, tasks, outcomes, config, whole=share is None and not finish)
+
+
+def _result(
+    out: Path,
+    tasks: Sequence[SceneTask],
+    outcomes: Mapping[str, SceneOutcome],
+    config: SampleConfig,
+    *,
+    whole: bool,
+) -> BuildResult:
+    splits = assign_splits(t.scene for t in tasks)
     entries: dict[str, SceneEntry] = {}
     failures: dict[str, TofError] = {}
-    skipped: list[str] = []
-    splits = assign_splits(found)
-    out = Path(out)
-    with _workers(jobs if jobs is not None else min(4, os.cpu_count() or 1)) as workers:
-        for scene in found:
-            path = out / "shards" / f"{scene}.h5"
-            try:
-                job = _job(scene, found[scene], rigs[scene], config)
-                digest = finished(job, path)
-                if digest is None:
-                    digest, _ = build_shard(job, path, workers, progress)
-                else:
-                    skipped.append(scene)
-            except TofError as err:
-                failures[scene] = err
-                continue
-            entries[scene] = SceneEntry(f"shards/{scene}.h5", digest, len(job.views), splits[scene])
-    _remove_partials(out)
-    gt = pooled_error(out / e.path for e in entries.values())
-    _finish(out, entries, config, gt)
-    return BuildResult(out, entries, tuple(skipped), failures, gt)
+    for task in tasks:
+        outcome = outcomes.get(task.scene, SceneOutcome(None))
+        if outcome.error is not None:
+            failures[task.scene] = outcome.error
+        elif outcome.sha256 is not None:
+            entries[task.scene] = SceneEntry(
+                f"shards/{task.scene}.h5", outcome.sha256, len(task.views), splits[task.scene]
+            )
+    missing = tuple(t.scene for t in tasks if t.scene not in entries and t.scene not in failures)
+    gt = None
+    if not missing and (whole or not failures):
+        gt = _finish(out, entries, config)
+    skipped = tuple(scene for scene, o in sorted(outcomes.items()) if o.skipped)
+    peak = max((o.peak_memory for o in outcomes.values()), default=0)
+    return BuildResult(out, entries, skipped, failures, missing, gt, peak)
 
 
-def _remove_partials(out: Path) -> None:
-    for stray in out.glob(f"**/*{PARTIAL}"):
-        stray.unlink(missing_ok=True)
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Wait until no other call finishes this dataset."""
+    import fcntl
 
-
-def _finish(
-    out: Path, entries: Mapping[str, SceneEntry], config: SampleConfig, gt: TruthError | None
-) -> None:
-    """Write the manifest last but for the card: a dataset with a manifest is whole."""
     out.mkdir(parents=True, exist_ok=True)
-    manifest = Manifest(entries, asdict(config), versions())
-    write_manifest(out, manifest)
-    write_card(out, manifest, None if gt is None else gt.table())
+    with (out / ".finish.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _finish(out: Path, entries: Mapping[str, SceneEntry], config: SampleConfig) -> TruthError | None:
+    """Write the manifest last but for the card: a dataset with a manifest is whole."""
+    with _alone(out):
+        for stray in out.glob(f"**/*{PARTIAL}"):
+            stray.unlink(missing_ok=True)
+        for work in (out / "shards").glob(f"{WORK}*"):
+            shutil.rmtree(work, ignore_errors=True)
+        gt = pooled_error(out / e.path for e in entries.values())
+        manifest = Manifest(entries, asdict(config), versions())
+        write_manifest(out, manifest)
+        write_card(out, manifest, None if gt is None else gt.table())
+    (out / ".finish.lock").unlink(missing_ok=True)
+    return gt

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import json
+import threading
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
+from tofcapture.files.hdf import dumps
+from tofcapture.files.info import tof_from, tof_table
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, TofMaps
 from tofcapture.frames import TofBurst, TofInfo, View
-from tofcapture.ops.crop import Crop, find_crop, inside
+from tofcapture.ops.crop import Crop, crop_depth, find_crop
 from tofcapture.ops.denoise import denoise
-from tofcapture.ops.normals import NormalField, grazing
-from tofcapture.ops.phase import decode, mean_phasors
+from tofcapture.ops.normals import GRAZING_COSINE, PlaneField
+from tofcapture.ops.phase import Decoder
 from tofcapture.ops.project import Projection, project, triangulate
 from tofcapture.ops.register import register
-from tofcapture.poses import Float64, rotate_vectors
+from tofcapture.poses import Float64
 from tofcapture.rig import Rig
 
 SCALES = (1, 2)
+SPARSE = 4  # pixels of the stereo grid between points that vote for the table
+WITHIN = 4.0  # standard deviations by which a triangle may miss the plane through its surroundings
 
 
 @dataclass(frozen=True)
@@ -66,20 +73,18 @@ def make_sample(view: View, rig: Rig, config: SampleConfig, rng: np.random.Gener
     check_cameras(view, rig)
     T_base_tof = view.arm_before.T_base_flange @ rig.T_flange_tof
     tof = decode_burst(view.tof, calibrated(view.tof.info, rig))
-    measured = view.stereo.points[..., 2]
-    native = np.where(denoise(measured, rig.stereo), measured, np.nan)
+    measured = np.ascontiguousarray(view.stereo.points[..., 2])
+    native = np.where(denoise(measured, rig.stereo), measured, np.float32(np.nan))
     sheet = triangulate(native, rig.stereo)
-    points = register(rig.stereo.unproject(sheet.depth), rig.T_tof_stereo, config.far)
-    field = NormalField(np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
-    measured_points = np.where(np.isfinite(native)[..., None], points, np.nan)
-    crop = find_crop(measured_points, T_base_tof[2, :3], rng, config.crop_radius, config.far)
+    field = PlaneField(np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
+    crop = find_crop(
+        _sparse_points(native, rig, config.far), T_base_tof[2, :3], rng, config.crop_radius, config.far
+    )
     truths = {}
     for scale in SCALES:
         camera = rig.tof.scaled(scale)
-        projection = project(sheet, points, camera, edge_pixels=scale)
-        truths[scale] = assemble(
-            projection, smooth_normals(projection, field, rig, camera), rig, camera, crop
-        )
+        projection = project(sheet, rig.stereo, rig.T_tof_stereo, camera, edge_pixels=scale, far=config.far)
+        truths[scale] = assemble(smoothed(projection, field, rig, camera), rig, camera, crop)
     if all((truth.mask & MaskBit.NOT_HIT).all() for truth in truths.values()):
         raise DataError(
             f"{view.scene} view {view.index}: stereo measured nothing in the ToF camera's view",
@@ -91,7 +96,7 @@ def make_sample(view: View, rig: Rig, config: SampleConfig, rng: np.random.Gener
         celsius=np.asarray(view.tof.celsius, dtype=np.float64),
         time_ns=np.asarray(view.tof.time_ns, dtype=np.int64),
         tof=tof,
-        native_depth=np.where(inside(crop, measured_points), native, np.nan).astype(np.float32),
+        native_depth=crop_depth(crop, native, rig.stereo, rig.T_tof_stereo),
         ground_truth=truths,
         T_base_tof=T_base_tof,
         truth=None if view.truth is None else ExactMaps(view.truth.depth, view.truth.normals),
@@ -119,42 +124,63 @@ def calibrated(info: TofInfo, rig: Rig) -> TofInfo:
 
 
 def decode_burst(burst: TofBurst, info: TofInfo) -> TofMaps:
-    """Average a burst as I and Q, decode it to depth."""
-    saturated: NDArray[np.bool_] = np.any(burst.raw >= info.saturation, axis=(0, 1))
-    decoded = decode(
-        mean_phasors(burst.raw, info.modulation_hz, info.phase_rad),
-        info.modulation_hz,
-        info.camera,
-        info.illuminator,
-        info.range_errors,
-        celsius=float(np.mean(burst.celsius)),
-        saturated=saturated,
-    )
-    depth = info.camera.radial_to_depth(decoded.radial)
-    return TofMaps(depth.astype(np.float32), decoded.confidence.astype(np.float32), saturated)
+    """Average a burst as I and Q, decode it to depth, confidence and flags."""
+    decoder = _decoder(dumps(tof_table(info)), threading.get_ident())
+    found = decoder.burst(burst.raw, float(np.mean(burst.celsius)))
+    return TofMaps(found.depth, found.confidence, found.flags)
 
 
-def smooth_normals(projection: Projection, field: NormalField, rig: Rig, camera: Camera) -> Float64:
-    """(H, W, 3) normals of the surface that is met, ToF frame, facing the ToF camera; a triangle's own where no fit does."""
+@lru_cache(maxsize=2)
+def _decoder(info: str, thread: int) -> Decoder:  # noqa: ARG001  a decoder's buffers serve one thread
+    """Build the tables of a camera once for all views of a scene."""
+    return Decoder(tof_from(json.loads(info), "tof_info"))
+
+
+def _sparse_points(native: NDArray[np.float32], rig: Rig, far: float) -> Float64:
+    """Every fourth stereo point of every fourth row, ToF frame: enough to find a table."""
+    points = native[::SPARSE, ::SPARSE, None] * rig.stereo.rays[::SPARSE, ::SPARSE]
+    return register(points, rig.T_tof_stereo, far)
+
+
+def smoothed(projection: Projection, field: PlaneField, rig: Rig, camera: Camera) -> Projection:
+    """Depth and normals of the planes that fit the surface where it is flat but for noise.
+
+    A ray's triangle is as noisy as three points; where the plane through the window about it is as good as planes here are,
+    and passes the triangle within the points' noise, the ray is intersected with that plane. Normals are those of the best
+    plane that faces the camera, a triangle's own where none does.
+    """
+    from tofcapture.ops.kernels.pixels import refine
+
     hit = np.isfinite(projection.depth)
-    fitted = rotate_vectors(rig.T_tof_stereo, field.at(projection.pixels[hit]))
-    usable = np.einsum("nc,nc->n", fitted, camera.rays[hit]) < 0  # NaN compares false
-    out = projection.normals.copy()
-    out[hit] = np.where(usable[:, None], fitted, out[hit])
+    planes, residuals = field.at(projection.pixels[hit])
+    depth, normals = projection.depth[hit], projection.normals[hit]
+    refine(planes, residuals, rig.T_tof_stereo, camera.rays[hit], WITHIN, depth, normals)
+    out = replace(projection, depth=projection.depth.copy(), normals=projection.normals.copy())
+    out.depth[hit], out.normals[hit] = depth, normals
     return out
 
 
-def assemble(projection: Projection, normals: Float64, rig: Rig, camera: Camera, crop: Crop) -> GroundTruth:
+def assemble(projection: Projection, rig: Rig, camera: Camera, crop: Crop) -> GroundTruth:
     """Put every reason for mistrust into the bits of one mask."""
-    points = camera.unproject(projection.depth)
-    bits: tuple[tuple[MaskBit, NDArray[np.bool_]], ...] = (
-        (MaskBit.NOT_HIT, ~np.isfinite(projection.depth)),
-        (MaskBit.OCCLUDED, projection.occluded),
-        (MaskBit.GRAZING, grazing(points, normals, (np.zeros(3), rig.T_tof_stereo[:3, 3]))),
-        (MaskBit.EDGE, projection.edge),
-        (MaskBit.OUTSIDE, ~inside(crop, points)),
-    )
+    from tofcapture.ops.kernels.pixels import judge
+
     mask = np.zeros(camera.shape, dtype=np.uint8)
-    for bit, where in bits:
-        mask[where] |= np.uint8(bit)
-    return GroundTruth(projection.depth.astype(np.float32), normals.astype(np.float32), mask)
+    for bit, where in (
+        (MaskBit.NOT_HIT, np.isnan(projection.depth)),
+        (MaskBit.OCCLUDED, projection.occluded),
+        (MaskBit.EDGE, projection.edge),
+    ):
+        mask |= where * np.uint8(bit)
+    judge(
+        projection.depth,
+        projection.normals,
+        camera.rays,
+        rig.T_tof_stereo[:3, 3].copy(),
+        GRAZING_COSINE,
+        np.append(crop.normal, crop.offset),
+        crop.centre,
+        np.array([crop.clearance, crop.radius, crop.far]),
+        (int(MaskBit.GRAZING), int(MaskBit.OUTSIDE)),
+        mask,
+    )
+    return GroundTruth(projection.depth.astype(np.float32), projection.normals.astype(np.float32), mask)

@@ -12,11 +12,15 @@ from numpy.typing import NDArray
 
 from tofcapture.dataset.sample import SampleConfig, make_sample
 from tofcapture.errors import DataError
+from tofcapture.files.layout import MaskBit
 from tofcapture.files.shard import GroundTruth, Sample, ShardReader
-from tofcapture.frames import View
+from tofcapture.frames import Truth, View
 from tofcapture.rig import Rig
 
 Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+WRONG = 0.002  # m; a pixel whose depth is off by more is wrong
+THROUGH = 0.005  # m; a pixel whose depth lies this far behind the truth shows what is behind it
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,71 @@ def view_error(sample: Sample, view: View) -> ViewError | None:
     gt = sample.ground_truth[2]
     covered = int(((gt.mask == 0) & view.truth.target).sum())
     return ViewError(_absolute(gt, view.truth.depth), covered, int(view.truth.target.sum()))
+
+
+@dataclass(frozen=True)
+class ClassError:
+    """Errors of the pixels of one mask class.
+
+    Attributes
+    ----------
+    errors
+        (n,) float32 absolute depth errors, metres; infinite where the truth has no surface.
+    through
+        Pixels whose depth lies behind the true surface: background seen through it.
+    """
+
+    errors: Float32
+    through: int
+
+    @property
+    def wrong(self) -> float:
+        """Share of pixels that are off by more than :data:`WRONG`."""
+        return float((self.errors > WRONG).mean()) if len(self.errors) else 0.0
+
+
+@dataclass(frozen=True)
+class CropShares:
+    """Of the pixels with sound depth, no edge among them: those of the object, those the crop keeps; the same of the rest."""
+
+    target: int
+    target_kept: int
+    other: int
+    other_kept: int
+
+
+def mask_classes(mask: NDArray[np.uint8]) -> dict[str, Bool]:
+    """Pixels (H, W) of each class.
+
+    ``object`` carries no bit and ``table`` only OUTSIDE; the others are the pixels with depth that carry a bit, whatever else
+    they carry, edge pixels only under ``edge``.
+    """
+    edge = (mask & MaskBit.EDGE) > 0
+    hit = (mask & MaskBit.NOT_HIT) == 0
+    return {
+        "object": mask == 0,
+        "table": mask == MaskBit.OUTSIDE,
+        "edge": hit & edge,
+        "grazing": hit & ~edge & ((mask & MaskBit.GRAZING) > 0),
+        "occluded": hit & ~edge & ((mask & MaskBit.OCCLUDED) > 0),
+    }
+
+
+def class_errors(gt: GroundTruth, truth: Truth) -> dict[str, ClassError]:
+    """Errors of ground truth at 2x, by mask class."""
+    error = gt.depth - truth.depth
+    absolute = np.where(np.isfinite(error), np.abs(error), np.float32(np.inf))
+    return {
+        name: ClassError(absolute[where], int((error[where] > THROUGH).sum()))
+        for name, where in mask_classes(gt.mask).items()
+    }
+
+
+def crop_shares(gt: GroundTruth, truth: Truth) -> CropShares:
+    """What the crop keeps of the object and of everything else, at 2x."""
+    sound = (gt.mask & ~np.uint8(MaskBit.OUTSIDE)) == 0
+    target, other, kept = sound & truth.target, sound & ~truth.target, gt.mask == 0
+    return CropShares(*(int(m.sum()) for m in (target, target & kept, other, other & kept)))
 
 
 def pool(views: list[ViewError]) -> TruthError:

@@ -11,16 +11,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.camera import Camera
 from tofcapture.poses import Float64
 
 Bool = NDArray[np.bool_]
 
 TRIALS = 1000  # finds a plane of a fifth of the points but for 3 in 10 000
+LEVEL_TRIALS = 8000  # finds a plane of a twelfth of the points but for 1 in 100
 SAMPLE = 20_000  # points that vote
 INLIER = 0.004  # m
+VOTED = 400  # level planes that are voted on: where many are level, most are the table
+REFINED = 40  # of them
 DOMINANT = 0.2  # share of the points below which there is no dominant plane
-UPRIGHT = 0.94  # cos 20 deg; a table is at most this far from level
+LEVEL = 0.08  # the same for a level plane: seldom anything but a table is one
+UPRIGHT = 0.985  # cos 10 deg; a table is at most this far from level
+SLANTED = 0.866  # cos 30 deg
 TALLEST = 0.4  # m; a parallel plane further below a flat top is the floor, not the table
+ABOVE = 3.0  # standard deviations of the table's points; one in 700 of them is higher
+LOWEST = 0.0008  # m; no table is flatter
 PARALLEL = 0.05  # share of the points that makes a parallel plane below
 
 
@@ -59,9 +67,9 @@ def _plane_of(points: Float64) -> tuple[Float64, float]:
     return normal, float(normal @ mean)
 
 
-def _candidates(points: Float64, rng: np.random.Generator) -> tuple[Float64, Float64]:
+def _candidates(points: Float64, rng: np.random.Generator, trials: int) -> tuple[Float64, Float64]:
     """Planes (T, 3), (T,) through random triples."""
-    a, b, c = np.moveaxis(points[rng.integers(0, len(points), (TRIALS, 3))], 1, 0)
+    a, b, c = np.moveaxis(points[rng.integers(0, len(points), (trials, 3))], 1, 0)
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
     normals = normals[length > 1e-9] / length[length > 1e-9, None]
@@ -82,27 +90,30 @@ def dominant_plane(
     rng
         Draws the triples; the same generator state gives the same plane.
     up
-        (3,) unit; only planes within 20 degrees of level count. ``None``: any.
+        (3,) unit; only planes within 10 degrees of level count. ``None``: any.
 
     Returns
     -------
     Unit normal (3,) towards the origin, offset, and the inliers' RMS distance in metres; ``None`` when fewer than a
-    fifth of the points agree on any plane.
+    fifth of the points agree on any plane, or a twelfth on any level one.
     """
     if len(points) < 50:
         return None
     points = points[:: max(1, len(points) // SAMPLE)]
-    normals, offsets = _candidates(points, rng)
+    normals, offsets = _candidates(points, rng, TRIALS if up is None else LEVEL_TRIALS)
     if up is not None:
-        level = np.abs(normals @ up) > UPRIGHT
+        level = np.flatnonzero(np.abs(normals @ up) > UPRIGHT)[:VOTED]
         normals, offsets = normals[level], offsets[level]
     if len(normals) == 0:
         return None
     voters = points[:: max(1, len(points) // 2000)]
     votes = (np.abs(voters @ normals.T - offsets) < INLIER).sum(axis=0)
-    best = int(votes.argmax())
-    normal, offset = normals[best], float(offsets[best])
-    return _refined(points, normal, offset, DOMINANT)
+    for best in np.argsort(-votes, kind="stable")[: 1 if up is None else REFINED]:
+        found = _refined(points, normals[best], float(offsets[best]), DOMINANT if up is None else LEVEL)
+        # Least squares may slide from a level triple to the inclined plane that it was drawn from.
+        if found is not None and (up is None or abs(found[0] @ up) > UPRIGHT):
+            return found
+    return None
 
 
 def _refined(
@@ -123,13 +134,16 @@ def table_plane(
     """Find the plane that things stand on.
 
     It is the dominant level plane, or the lowest parallel one within an object's height below it. Without a dominant level
-    plane (an arm on a wall: its base is not upright) any dominant plane is taken.
+    plane (an arm on a wall: its base is not upright) any dominant plane is taken that is more than 30 degrees from level; one
+    in between is an inclined object that fills the view.
 
     Parameters and result as for :func:`dominant_plane`.
     """
-    found = dominant_plane(points, rng, up) or dominant_plane(points, rng)
+    found = dominant_plane(points, rng, up)
     if found is None:
-        return None
+        found = dominant_plane(points, rng)
+        if found is None or abs(found[0] @ up) > SLANTED:
+            return None
     normal, offset, _ = found
     below = offset - points @ normal
     below = below[(below > 2 * INLIER) & (below < TALLEST)]
@@ -176,7 +190,7 @@ def find_crop(
     normal, offset, rms = found
     depth = offset / normal[2] if abs(normal[2]) > 0.1 else np.inf  # where the optical axis meets the table
     axis = np.array([0.0, 0.0, depth if 0 < depth < far else float(np.median(cloud[:, 2]))])
-    return Crop(normal, offset, axis, radius, max(0.003, 5 * rms), far)
+    return Crop(normal, offset, axis, radius, max(LOWEST, ABOVE * rms), far)
 
 
 def inside(crop: Crop, points: NDArray[np.floating]) -> Bool:
@@ -196,4 +210,21 @@ def inside(crop: Crop, points: NDArray[np.floating]) -> Bool:
     height = points @ crop.normal - crop.offset
     along = (points - crop.centre) - ((points - crop.centre) @ crop.normal)[..., None] * crop.normal
     out: Bool = near & (height > crop.clearance) & (np.linalg.norm(along, axis=-1) < crop.radius)
+    return out
+
+
+def crop_depth(
+    crop: Crop, depth: NDArray[np.float32], camera: Camera, T_tof_camera: Float64
+) -> NDArray[np.float32]:
+    """Keep the depths (H, W) of another camera whose points are inside; the others become NaN.
+
+    The same rule as :func:`inside`, without the points ever being held in memory.
+    """
+    from tofcapture.ops.kernels.crop import above
+
+    out = np.empty(depth.shape, np.float32)
+    limits = np.array([crop.clearance, crop.radius, crop.far])
+    x, y = camera.rays[0, :, 0].copy(), camera.rays[:, 0, 1].copy()
+    plane = np.append(crop.normal, crop.offset)
+    above(depth, x, y, plane, crop.centre, limits, T_tof_camera, out)
     return out

@@ -18,7 +18,7 @@ from tofcapture.errors import DataError
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-RADII = (2, 4, 8, 12)  # pixels, windows that normals_at chooses from
+RADII = (2, 4, 8, 12)  # pixels, windows that PlaneField chooses from
 TOLERANCE = 2.0  # a window is flat while its residual is below this many times the median of such windows
 GRAZING_COSINE = 0.25882  # cos 75 deg
 _MIN_SPREAD = 1e-4  # det / trace^2 of the window's rays; below, they are a line and the plane may swivel
@@ -132,16 +132,8 @@ def gated_normals(
     return _facing(_fit(sums)[0], camera.rays, depth)
 
 
-def _integral(moments: Float64) -> Float64:
-    """(H + 1, W + 1, 10) sums over all pixels above and to the left."""
-    out = np.zeros((moments.shape[0] + 1, moments.shape[1] + 1, moments.shape[2]))
-    np.cumsum(moments, axis=0, out=out[1:, 1:])
-    np.cumsum(out[1:, 1:], axis=1, out=out[1:, 1:])
-    return out
-
-
-class NormalField:
-    """Normals of a depth image wherever they are asked for, in windows as large as the surface is flat.
+class PlaneField:
+    """Planes through a depth image wherever they are asked for, in windows as large as the surface is flat.
 
     Windows of several sizes are fitted at each place, and the largest is taken whose residual is what noise leaves in such
     windows (their median); beside creases that is a small one. The image's moments are summed once.
@@ -155,42 +147,49 @@ class NormalField:
     """
 
     def __init__(self, depth: NDArray[np.floating], camera: Camera) -> None:
-        self._integral = _integral(_moments(depth, camera))
-        self._shape = camera.shape
+        from tofcapture.ops.kernels.planes import table
 
-    def _sums(self, u: NDArray[np.int64], v: NDArray[np.int64], radius: int) -> Float64:
-        height, width = self._shape
-        left, right = np.clip(u - radius, 0, width), np.clip(u + radius + 1, 0, width)
-        top, bottom = np.clip(v - radius, 0, height), np.clip(v + radius + 1, 0, height)
-        table = self._integral
-        out: Float64 = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
-        return out
+        if depth.shape != camera.shape:
+            raise DataError(f"normals: expected depth of shape {camera.shape}, got {depth.shape}")
+        self._camera = camera
+        self._sums = table(depth, camera.rays[0, :, 0].copy(), camera.rays[:, 0, 1].copy())
 
-    def at(self, pixels: Float64, radii: Sequence[int] = RADII) -> Float64:
-        """Normals at pixel coordinates.
+    def at(self, pixels: Float64, radii: Sequence[int] = RADII) -> tuple[Float64, Float64]:
+        """Planes at pixel coordinates.
 
         Parameters
         ----------
         pixels
             (n, 2) as (u, v), inside the image.
         radii
-            Of the windows to choose from, ascending.
+            Of the windows to choose from, ascending, pixels; windows are whole cells of 2 x 2 pixels.
 
         Returns
         -------
-        (n, 3) float64, unit, camera frame, facing the camera's plane; NaN where no window determines a plane.
+        planes
+            (n, 3) float64 m with ``m . p = 1`` for points p of the plane, camera frame, 1 / metres; its normal is -m / |m|.
+            NaN where no window determines a plane.
+        residual
+            (n,) standard deviation of inverse depth about it, 1 / metres; NaN where no window is flat.
         """
-        u, v = np.rint(pixels).astype(np.int64).T
-        best = np.full((len(u), 3), np.nan)
-        for radius in radii:
-            normals, residual = _fit(self._sums(u, v, radius))
-            fitted = np.isfinite(normals[:, 0])
-            if not fitted.any():
-                continue
-            flat = fitted & (residual <= TOLERANCE * np.median(residual[fitted]))
-            flat |= np.isnan(best[:, 0]) & fitted
-            best[flat] = normals[flat]
-        return best
+        from tofcapture.ops.kernels.planes import CELL, choose, fits
+
+        pixels = np.ascontiguousarray(pixels, dtype=np.float64)
+        planes, residuals = np.empty((len(pixels), len(radii), 3)), np.empty((len(pixels), len(radii)))
+        cells = np.array([max(1, r // CELL) for r in radii])
+        fits(self._sums, pixels, cells, _MIN_SPREAD, planes, residuals)
+        chosen, residual = np.empty((len(pixels), 3)), np.empty(len(pixels))
+        eye = self._camera
+        rays = (pixels - [eye.cx, eye.cy]) / [eye.fx, eye.fy]
+        limits = [_typical(residuals[:, k]) for k in range(len(radii))]
+        choose(planes, residuals, TOLERANCE * np.array(limits), cells, rays, chosen, residual)
+        return chosen, residual
+
+
+def _typical(residuals: Float64) -> float:
+    """Median of those that there are; NaN for none."""
+    fitted = residuals[np.isfinite(residuals)]
+    return float(np.median(fitted)) if len(fitted) else np.nan
 
 
 def grazing(points: Float64, normals: Float64, eyes: Sequence[Float64]) -> Bool:

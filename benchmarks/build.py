@@ -1,0 +1,154 @@
+"""Views per second of build-dataset, whole: reading, decoding, ground truth, compression, verification, fsync.
+
+    python -m benchmarks.build RECORDING [--jobs 2] [--peer-views 2] [--skip-peer]
+
+A simulated recording, with the true rig. Printed: views/s of the build by wall clock and by CPU time (all processes), the largest
+process, seconds per stage of one view (CPU, median over views), and the same of a plain Open3D script (build_peer.py) on the
+first views of the same recording in the same run, with both errors of ground truth: over our pixels, where both have depth.
+Compilation happens once a machine and is left out by building one scene first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import shutil
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import build_peer
+from tofcapture.dataset.build import build_dataset, scene_tasks
+from tofcapture.dataset.sample import (
+    SampleConfig,
+    _sparse_points,
+    assemble,
+    decode_burst,
+    make_sample,
+    smoothed,
+)
+from tofcapture.dataset.truth import view_error
+from tofcapture.files.seal import sealed_digest
+from tofcapture.files.shard_writer import ShardWriter
+from tofcapture.files.view import read_view
+from tofcapture.ops.crop import crop_depth, find_crop
+from tofcapture.ops.denoise import denoise
+from tofcapture.ops.normals import PlaneField
+from tofcapture.ops.project import project, triangulate
+
+
+def cpu() -> float:
+    """CPU seconds of this process and its finished children."""
+    return sum(
+        r.ru_utime + r.ru_stime
+        for r in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )
+
+
+class Stages:
+    """CPU seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, list[float]] = {}
+
+    def __call__(self, name: str, function: Callable, *args, **kwargs):
+        """Call a function and note its time."""
+        start = time.process_time()
+        out = function(*args, **kwargs)
+        self.seconds.setdefault(name, []).append(time.process_time() - start)
+        return out
+
+
+def stages(paths: list[Path], rig, folder: Path) -> Stages:
+    """Every stage of some views, one after the other, in this process."""
+    run, config = Stages(), SampleConfig()
+    for path in paths:
+        run("digest of the view", sealed_digest, path)
+        view = run("read the view", read_view, path)
+        rng = np.random.default_rng(view.index)
+        run("decode ToF", decode_burst, view.tof, view.tof.info)
+        measured = np.ascontiguousarray(view.stereo.points[..., 2])
+        native = np.where(run("denoise", denoise, measured, rig.stereo), measured, np.float32(np.nan))
+        sheet = run("triangulate", triangulate, native, rig.stereo)
+        field = run("sums for planes", PlaneField, np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
+        up = (view.arm_before.T_base_flange @ rig.T_flange_tof)[2, :3]
+        crop = run("crop", lambda n=native, u=up, g=rng: find_crop(_sparse_points(n, rig, config.far), u, g))
+        run("crop native", crop_depth, crop, native, rig.stereo, rig.T_tof_stereo)
+        for scale in (1, 2):
+            camera = rig.tof.scaled(scale)
+            found = run(
+                f"project {scale}x", project, sheet, rig.stereo, rig.T_tof_stereo, camera, scale, config.far
+            )
+            found = run(f"planes {scale}x", smoothed, found, field, rig, camera)
+            run(f"mask {scale}x", assemble, found, rig, camera, crop)
+        sample = run("ALL OF make_sample", make_sample, view, rig, config, np.random.default_rng(view.index))
+        with ShardWriter(folder / "s.h5", view.scene, rig, view.tof.info, view.stereo.info, 1) as shard:
+            run("compress", shard.add, sample)
+            run("verify, fsync", shard.seal, {})
+    return run
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--peer-views", type=int, default=2)
+    parser.add_argument("--skip-peer", action="store_true")
+    args = parser.parse_args()
+    folder = Path(tempfile.mkdtemp())
+    try:
+        tasks = scene_tasks([args.recording], folder / "dataset", true_rig=True)
+        rig, views = tasks[0].rig, [v for t in tasks for v in t.views]
+        stages(views[:1], rig, folder)  # compiles
+        found = stages(views[:: max(1, len(views) // 6)], rig, folder)
+        for name, seconds in found.seconds.items():
+            print(f"  {name:<20} {1e3 * statistics.median(seconds):7.1f} ms of CPU")
+        wall, used = time.perf_counter(), cpu()
+        result = build_dataset([args.recording], folder / "dataset", true_rig=True, jobs=args.jobs)
+        wall, used = time.perf_counter() - wall, cpu() - used
+        ours = len(views) / wall
+        print(f"ours: {len(views)} views, {ours:.2f} views/s by the clock with {args.jobs} processes, start included; "
+              f"{used / len(views):.3f} s of CPU a view, {args.jobs * len(views) / used:.2f} views/s where {args.jobs} cores "
+              f"are free; largest process {result.peak_memory / 2**30:.2f} GiB")  # fmt: skip
+        print(f"ours: {result.gt}")
+        if not args.skip_peer:
+            peer(
+                views[:: max(1, len(views) // args.peer_views)][: args.peer_views],
+                rig,
+                folder,
+                ours,
+                used / len(views),
+            )
+    finally:
+        shutil.rmtree(folder)
+
+
+def peer(paths: list[Path], rig, folder: Path, ours: float, our_cpu: float) -> None:
+    """The plain script on some views; ratios."""
+    wall, used, both = time.perf_counter(), time.process_time(), []
+    both += [build_peer.build(path, rig, folder / f"{path.stem}.npz") for path in paths]
+    wall, used = time.perf_counter() - wall, time.process_time() - used
+    theirs = len(paths) / wall
+    print(f"plain script: {theirs:.3f} views/s by the clock, {used / len(paths):.2f} s of CPU a view; "
+          f"ours is {ours / theirs:.1f} times as fast, {used / len(paths) / our_cpu:.1f} times by CPU")  # fmt: skip
+    errors = {"ours": [], "plain, its ICP": [], "plain, true rig": []}
+    for arrays, view in both:
+        sample = make_sample(view, rig, SampleConfig(), np.random.default_rng(view.index))
+        errors["ours"].append(view_error(sample, view).errors)
+        good = sample.ground_truth[2].mask == 0
+        for name, key in (("plain, its ICP", "icp"), ("plain, true rig", "rig")):
+            wrong = np.abs(arrays[f"{key}_depth_2x"] - view.truth.depth)[good]
+            errors[name].append(wrong[np.isfinite(wrong)])
+    for name, parts in errors.items():
+        median, p99 = np.percentile(np.concatenate(parts), [50, 99]) * 1e3
+        print(f"  error, {name:<16} median {median:.3f} mm, p99 {p99:.3f} mm")
+
+
+if __name__ == "__main__":
+    main()
