@@ -30,12 +30,16 @@ class StationContext:
     folder
         Where that file lies; relative paths in it start here.
     shared
-        Drivers that belong together keep what they share here, for instance the simulated world.
+        Drivers that belong together keep what they share here, for instance the simulated world. The station puts every
+        device here, under its role, as soon as it is open.
+    allow_motion
+        The operator allowed real arms to move, in this run.
     """
 
     config: Mapping[str, Any]
     folder: Path
     shared: dict[str, Any] = field(default_factory=dict)
+    allow_motion: bool = False
 
 
 Factory = Callable[[Mapping[str, Any], StationContext], Any]

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture.devices import Arm, Operator, StereoDevice, TofCamera
+from tofcapture.devices.consent import StillArm
 from tofcapture.devices.registry import ROLES, StationContext, make_device
 from tofcapture.errors import ConfigError, DeviceError, TofError
 from tofcapture.files.info import stereo_table, tof_table
@@ -103,7 +104,9 @@ def read_station(path: Path | None, seed: int | None = None) -> dict[str, Any]:
 
 
 @contextmanager
-def open_station(path: Path | None = None, seed: int | None = None) -> Iterator[Station]:
+def open_station(
+    path: Path | None = None, seed: int | None = None, *, allow_motion: bool = False
+) -> Iterator[Station]:
     """Open every device of a station; on leaving, stop the arm after an error, and close all in reverse order.
 
     Parameters
@@ -112,6 +115,8 @@ def open_station(path: Path | None = None, seed: int | None = None) -> Iterator[
         ``station.toml``; ``None`` for the embedded simulated station.
     seed
         Replaces ``[sim] seed``.
+    allow_motion
+        Let a real arm move. Without it ``station.arm`` refuses every ``move_to``; simulated arms always move.
 
     Raises
     ------
@@ -121,10 +126,16 @@ def open_station(path: Path | None = None, seed: int | None = None) -> Iterator[
         Devices do not open; the message names all of them.
     """
     config = read_station(path, seed)
-    context = StationContext(config=config, folder=(path or DEFAULT).resolve().parent)
+    folder = (path or DEFAULT).resolve().parent
+    context = StationContext(config=config, folder=folder, allow_motion=allow_motion)
     with ExitStack() as stack:
         devices = _open_all(context, stack)
-        station = Station(**devices, rig=_rig(context), config=config)
+        rig = _rig(context)
+        if hasattr(devices["arm"], "equip"):
+            devices["arm"].equip(rig)
+        if not (allow_motion or getattr(devices["arm"], "simulated", False)):
+            devices["arm"] = StillArm(devices["arm"])
+        station = Station(**devices, rig=rig, config=config)
         try:
             yield station
         except BaseException:
@@ -141,6 +152,7 @@ def _open_all(context: StationContext, stack: ExitStack) -> dict[str, Any]:
             device = make_device(role, context)
             # An operator has nothing to open, unless its driver says so.
             devices[role] = stack.enter_context(device) if hasattr(device, "__enter__") else device
+            context.shared[role] = devices[role]
         except TofError as err:
             failures.append((role, err))
         except Exception as err:
@@ -151,8 +163,9 @@ def _open_all(context: StationContext, stack: ExitStack) -> dict[str, Any]:
 
 
 def _refuse(failures: list[tuple[str, TofError]]) -> None:
-    """Raise all failures as one."""
-    kind = ConfigError if all(isinstance(err, ConfigError) for _, err in failures) else DeviceError
+    """Raise all failures as one; those of one kind, as an arm's protective stop, keep it."""
+    kinds = {type(err) for _, err in failures}
+    kind: type[TofError] = kinds.pop() if len(kinds) == 1 else DeviceError
     text = "; ".join(f"{role}: {err.message}" for role, err in failures)
     hints = dict.fromkeys(err.hint for _, err in failures if err.hint)
     raise kind(f"{len(failures)} of {len(ROLES)} devices do not open: {text}", hint="; ".join(hints))

@@ -1,0 +1,212 @@
+"""Driver host: whatever a vendor's library does, the station gets an answer or a named error, and no process stays."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofcapture.devices.faults import HostLost
+from tofcapture.devices.host import channel, hosted, process
+from tofcapture.devices.registry import StationContext
+from tofcapture.errors import ConfigError, DeviceError, MotionRefused
+from tofcapture.testing import misbehaving
+
+CONTEXT = StationContext({}, Path())
+CAMERA, ARM = "tofcapture.testing.misbehaving:Camera17", "tofcapture.testing.misbehaving:Arm17"
+
+
+def _camera(deadline=20.0, **table):
+    return hosted("tof", CAMERA, {"capture": deadline, "__enter__": deadline})(table, CONTEXT)
+
+
+def _alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # A child that its parent has not waited for is dead all the same.
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def _gone(pid, seconds):
+    end = time.monotonic() + seconds
+    while _alive(pid) and time.monotonic() < end:
+        time.sleep(0.05)
+    return not _alive(pid)
+
+
+def test_bursts_come_through_whole():
+    """A burst from the child equals the one made here, can be written to, and the child is gone after closing."""
+    camera = _camera()
+    assert camera.describe() is not None
+    with camera:
+        pid = camera.pid
+        assert pid != os.getpid()
+        burst = camera.capture(3)
+        expected = misbehaving.Camera17({}, CONTEXT).capture(3)
+        np.testing.assert_array_equal(burst.raw, expected.raw)
+        assert burst.raw.dtype == np.uint16
+        burst.raw[0] = 0
+        np.testing.assert_array_equal(camera.capture(3).raw, expected.raw)
+    assert not _alive(pid)
+    with pytest.raises(DeviceError, match="not open"):
+        camera.capture(1)
+
+
+def test_messages_of_any_size_survive_the_channel():
+    """Small, large, empty, strided and nested arrays arrive as they were sent, and no descriptor is left open."""
+    here, there = channel.pair()
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    rng = np.random.default_rng(0)
+    big = rng.random((300, 200))
+    for message in ({"a": np.zeros(0)}, [big, big.T, big[::2], np.arange(5)], "x" * 100_000, None):
+        channel.send(here, message)
+        got = channel.receive(there)
+        np.testing.assert_equal(got, message)
+        del got
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    here.close()
+    with pytest.raises(EOFError):
+        channel.receive(there)
+    there.close()
+
+
+@pytest.mark.parametrize(
+    ("how", "pattern"),
+    [
+        pytest.param("hang", "took more than 1 s", marks=pytest.mark.slow),
+        ("crash", "exit status -11"),
+        ("print", "status 4; it last said: vendor says hello"),
+    ],
+)
+def test_a_lost_camera_is_named_and_replaced(tmp_path, how, pattern):
+    """A child that hangs, crashes or ends is a named error with its last words; the next call has a new child."""
+    with _camera(1.0, capture=how, once=str(tmp_path / "once")) as camera:
+        first = camera.pid
+        with pytest.raises(HostLost, match=pattern):
+            camera.capture(1)
+        assert camera.capture(1).raw.shape[0] == 1
+        assert camera.pid != first
+        assert not _alive(first)
+
+
+def test_a_library_that_holds_the_lock_is_noticed(monkeypatch):
+    """Silence ends a call long before its deadline when the library keeps Python from running."""
+    monkeypatch.setattr(process, "SILENCE", 1.0)
+    with (
+        _camera(60.0, capture="hang holding the lock") as camera,
+        pytest.raises(HostLost, match="fell silent"),
+    ):
+        camera.capture(1)
+
+
+def test_opening_has_a_deadline():
+    """A constructor that hangs holding the lock is killed at its deadline."""
+    camera = _camera(1.0, open="hang holding the lock")
+    with pytest.raises(HostLost, match="__enter__ took more than 1 s"), camera:
+        pass
+
+
+def test_vendor_errors_are_named_and_ours_pass_as_they_are():
+    """Another library's exception becomes a DeviceError with its name; ours keep message and hint. The child lives on."""
+    with _camera(capture="raise") as camera:
+        pid = camera.pid
+        with pytest.raises(DeviceError, match="LookupError: VENDOR_STATUS_17"):
+            camera.capture(1)
+        assert camera.pid == pid
+    with _camera(capture="refuse") as camera, pytest.raises(DeviceError, match="lens cap") as caught:
+        camera.capture(1)
+    assert caught.value.hint == "take it off"
+
+
+def test_stop_reaches_a_move():
+    """Another thread's stop ends a running move at once."""
+    with hosted("arm", ARM)({"seconds": 30.0}, CONTEXT) as arm:
+        timer = threading.Timer(0.3, arm.stop)
+        timer.start()
+        start = time.monotonic()
+        with pytest.raises(MotionRefused, match="on request"):
+            arm.move_to(np.ones(6))
+        assert time.monotonic() - start < 10
+        timer.join()
+        assert arm.state().joints.tolist() == [0.0] * 6
+
+
+def test_a_lost_arm_is_not_replaced():
+    """An arm whose process died says so again and again until it is opened anew; stop stays allowed."""
+    arm = hosted("arm", ARM)({"move": "crash"}, CONTEXT)
+    with arm:
+        for call in (lambda: arm.move_to(np.ones(6)), arm.state, arm.state):
+            with pytest.raises(HostLost, match="-11"):
+                call()
+        arm.stop()
+    with arm:
+        assert arm.state().joints.shape == (6,)
+
+
+def test_targets_must_import():
+    """A driver that does not import, and a role that is none, are refused at once."""
+    with pytest.raises(DeviceError, match="nowhere"):
+        hosted("tof", "nowhere.at.all:X")({}, CONTEXT)
+    with pytest.raises(ConfigError, match="role"):
+        hosted("operator", CAMERA)
+
+
+_PARENT = """
+    import sys, threading, time
+    from pathlib import Path
+    from tofcapture.devices.host import hosted
+    from tofcapture.devices.registry import StationContext
+    table = {{"{verb}": "{how}"}}
+    camera = hosted("tof", "tofcapture.testing.misbehaving:Camera17", {{"__enter__": {deadline}}})(table, StationContext({{}}, Path()))
+    def tell():
+        while camera.pid is None:
+            time.sleep(0.01)
+        time.sleep(1.0)
+        print(camera.pid, flush=True)
+    threading.Thread(target=tell).start()
+    with camera:
+        camera.capture(1)
+        time.sleep(100)
+"""
+
+
+def _orphan(verb, how, deadline):
+    """Kill a parent in the middle of a call; the number of its child."""
+    text = textwrap.dedent(_PARENT).format(verb=verb, how=how, deadline=deadline)
+    parent = subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, text=True)
+    # The child is known once its host is; a hanging constructor keeps it from answering.
+    line = parent.stdout.readline() if how != "hang holding the lock" else _child_of(parent.pid)
+    parent.send_signal(signal.SIGKILL)
+    parent.communicate()
+    return int(line)
+
+
+def _child_of(pid):
+    end = time.monotonic() + 20
+    while time.monotonic() < end:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        if children:
+            time.sleep(2.0)
+            return children[0]
+        time.sleep(0.05)
+    raise AssertionError("no child")
+
+
+@pytest.mark.parametrize("how", ["hang", pytest.param("", marks=pytest.mark.slow)])
+def test_no_orphans(how):
+    """SIGKILL of the station's process ends the driver's process, idle or in a call."""
+    assert _gone(_orphan("capture", how, 5.0), 5)
+
+
+@pytest.mark.slow
+def test_no_orphans_when_the_library_holds_the_lock():
+    """Even a child that cannot run Python ends: a timer in C ends it."""
+    assert _gone(_orphan("open", "hang holding the lock", 6.0), 15)

@@ -1,0 +1,163 @@
+"""Every fault of the controller, with the real ``ur_rtde`` library against the emulator: named in time, and nothing hangs."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from tofcapture.devices import faults
+from tofcapture.devices.kinematics import HOME
+from tofcapture.devices.station import open_station
+from tofcapture.testing.stations import ur_station
+from tofcapture.testing.ur_emulator.process import Emulator
+
+pytest.importorskip("rtde_control", reason="the ur_rtde library is not installed")
+
+LIMIT = 15.0  # s within which a fault has its name
+THERE = HOME - [1.2, 0, 0, 0, 0, 0]
+
+
+@pytest.fixture(scope="module")
+def running():
+    with Emulator() as emulator:
+        yield emulator
+
+
+@pytest.fixture
+def emulator(running):
+    """The emulator at rest, without faults."""
+    running.calm()
+    return running
+
+
+def _station(tmp_path, emulator, more=""):
+    file = tmp_path / "station.toml"
+    file.write_text(ur_station(emulator.host, more))
+    return file
+
+
+def _at_home(arm):
+    """Wherever an earlier test left the arm, it begins at home."""
+    if np.abs(arm.state().joints - HOME).max() > 1e-3:
+        arm.move_to(HOME)
+
+
+MOVING = {
+    "protective_stop": faults.ProtectiveStop,
+    "emergency_stop": faults.EmergencyStop,
+    "script_death": faults.ProgramStopped,
+    "drop": faults.LinkLost,
+    "freeze": faults.StaleData,
+    "nan": faults.StaleData,
+}
+
+
+def _fault_in_motion(emulator, tmp_path, order):
+    with open_station(_station(tmp_path, emulator), allow_motion=True) as station:
+        _at_home(station.arm)
+        emulator.order(order, share=0.3)
+        start = time.monotonic()
+        with pytest.raises(MOVING[order]) as caught:
+            station.arm.move_to(THERE)
+        assert time.monotonic() - start < LIMIT
+        assert caught.value.hint
+        # The state is kept until a person opens the station anew, and stopping stays allowed.
+        with pytest.raises(MOVING[order]):
+            station.arm.state()
+        station.arm.stop()
+    assert np.abs(np.array(emulator.rest(3)["joints"]) - THERE).max() > 1e-3
+
+
+@pytest.mark.parametrize("order", ["drop", "freeze"])
+def test_faults_in_motion(emulator, tmp_path, order):
+    """A fault in mid-move has its name in time, and the arm stands still soon after, on its way."""
+    _fault_in_motion(emulator, tmp_path, order)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", ["protective_stop", "emergency_stop", "script_death", "nan"])
+def test_more_faults_in_motion(emulator, tmp_path, order):
+    """The other faults in mid-move."""
+    _fault_in_motion(emulator, tmp_path, order)
+
+
+def _read_on(arm):
+    for _ in range(100):
+        arm.state()
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", list(MOVING))
+def test_faults_at_rest(emulator, tmp_path, order):
+    """A fault while the arm stands is noticed by the next call."""
+    with open_station(_station(tmp_path, emulator), allow_motion=True) as station:
+        emulator.order(order)
+        start = time.monotonic()
+        with pytest.raises(MOVING[order]):
+            _read_on(station.arm)
+        assert time.monotonic() - start < LIMIT
+
+
+# The probe talks first; what it lets pass must hang the library: V, v and O are asked by both.
+HANGS = [("I", 0), ("connect", 1), ("V", 1), ("v", 1), ("O", 1), ("O", 2), ("S", 1), ("S", 2), ("banner", 1)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stage", "skip"), [*HANGS, ("dashboard", 2), ("ready", 0), ("done", 0)])
+def test_the_library_is_never_waited_for(emulator, tmp_path, stage, skip):
+    """A controller that falls silent once the library talks to it is named silent in time, though the library hangs."""
+    emulator.order("mute", stage=stage, skip=skip)
+    start = time.monotonic()
+    with pytest.raises(faults.ControllerSilent), open_station(_station(tmp_path, emulator)):
+        pass
+    assert time.monotonic() - start < LIMIT
+
+
+@pytest.mark.slow
+def test_dead_script(emulator, tmp_path):
+    """A controller that never starts the script is named so in time."""
+    emulator.order("mute", stage="script")
+    start = time.monotonic()
+    with pytest.raises(faults.ProgramStopped), open_station(_station(tmp_path, emulator)):
+        pass
+    assert time.monotonic() - start < LIMIT
+
+
+@pytest.mark.slow
+def test_killed_driver(emulator, tmp_path):
+    """SIGKILL of the driver's process in mid-move is named, and the controller's watchdog stops the arm on its way."""
+    with open_station(_station(tmp_path, emulator), allow_motion=True) as station:
+        _at_home(station.arm)
+        timer = threading.Timer(0.5, os.kill, (station.arm.pid, signal.SIGKILL))
+        timer.start()
+        with pytest.raises(faults.HostLost, match="exit status -9"):
+            station.arm.move_to(THERE)
+        timer.join()
+        assert np.abs(np.array(emulator.rest(3)["joints"]) - THERE).max() > 1e-3
+
+
+@pytest.mark.slow
+def test_killed_station(emulator, tmp_path):
+    """SIGKILL of the station's process in mid-move stops the arm on its way; the next run goes on."""
+    file = _station(tmp_path, emulator)
+    with open_station(file, allow_motion=True) as station:
+        _at_home(station.arm)
+    program = (
+        "import sys; from pathlib import Path; from tofcapture.devices.station import open_station\n"
+        f"with open_station(Path({str(file)!r}), allow_motion=True) as s: s.arm.move_to({THERE.tolist()})"
+    )
+    child = subprocess.Popen([sys.executable, "-c", program])
+    while not emulator.order("status")["moving"]:
+        time.sleep(0.02)
+    time.sleep(0.3)
+    child.kill()
+    child.wait()
+    assert np.abs(np.array(emulator.rest(3)["joints"]) - THERE).max() > 1e-3
+    with open_station(file, allow_motion=True) as station:
+        _at_home(station.arm)

@@ -1,0 +1,172 @@
+"""Where the arm and the rig may be: a coarse model, stricter than needed, behind the controller's own safety limits.
+
+The arm is a chain of points every few centimetres along its links, the rig a ball about its cameras. None may come near the
+table, into the keep-out cylinder about the object, to the arm's own base, or to its upper arm. This is no replacement for
+safety planes in the controller: it only keeps plans out of trouble. Plans are made with it, and drivers of real arms check
+every motion with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.devices.kinematics import HOME, ArmModel, link_frames
+from tofcapture.errors import ConfigError, MotionRefused
+from tofcapture.poses import Float64, check_transform
+from tofcapture.rig import Rig
+
+_LINK = 0.08  # m; radius of the arm's links
+_BLOCK = 0.07  # m; radius of the ball about the cameras
+_TABLE_MARGIN = 0.04  # m; air above the table, beyond the radii
+_COLUMN = 0.20  # m; the flange and the rig keep this far from the base's axis
+_STEP = np.radians(3.0)  # largest joint step between checks on a path
+_SAMPLES = np.linspace(0.0, 1.0, 8)
+
+_SHAPES = {"target": (3,), "board": (3,), "board_normal": (3,), "home": (6,)}  # the others are numbers
+
+REASONS = ("table", "object", "base", "self")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Where things stand, in the base frame, metres.
+
+    Attributes
+    ----------
+    table
+        Height of the table top.
+    target
+        (3,) what object views look at.
+    board, board_normal
+        (3,) what calibration views look at, and the direction its front faces.
+    keep_out_radius, keep_out_height
+        Upright cylinder about the target, its height above the table.
+    home
+        (6,) joint angles of a pose from which every view is reached, radians.
+    """
+
+    table: float
+    target: Float64
+    board: Float64
+    board_normal: Float64
+    keep_out_radius: float = 0.30
+    keep_out_height: float = 0.30
+    home: Float64 = field(default_factory=HOME.copy)
+
+
+def stage_of(config: Mapping[str, Any]) -> Stage:
+    """Read the ``[plan]`` table of a station.
+
+    Raises
+    ------
+    ConfigError
+        Missing, with unknown keys, or with anything but finite numbers.
+    """
+    table = config.get("plan")
+    if table is None:
+        raise ConfigError("station: expected a table [plan] that says where the table and the object stand")
+    try:
+        values = {key: np.asarray(value, dtype=np.float64) for key, value in table.items()}
+        stage = Stage(**{key: v if v.ndim else float(v) for key, v in values.items()})  # type: ignore[arg-type]
+    except (TypeError, ValueError) as err:
+        raise ConfigError(
+            f"station: [plan]: {err}", hint="see the comments of the embedded station.toml"
+        ) from err
+    for key, v in values.items():
+        shape = _SHAPES.get(key, ())
+        if v.shape != shape or not np.isfinite(v).all():
+            raise ConfigError(
+                f"station: [plan] {key}: expected {f'{shape[0]} finite numbers' if shape else 'a finite number'}, got {v.tolist()}"
+            )
+    return stage
+
+
+def obstacles(model: ArmModel, rig: Rig, stage: Stage, joints: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Say what is in the way at joint angles.
+
+    Parameters
+    ----------
+    model, rig, stage
+        The arm, what it carries, what stands around it.
+    joints
+        (..., 6), radians.
+
+    Returns
+    -------
+    (..., 4) bool, one per entry of :data:`REASONS`.
+    """
+    frames = link_frames(model, joints)
+    origins = frames[..., :3, 3]
+    flange = frames[..., 5, :, :]
+    cameras = np.stack(
+        [(flange @ check_transform(T))[..., :3, 3] for T in (rig.T_flange_tof, rig.T_flange_stereo)], axis=-2
+    )
+    a, b = origins[..., :-1, None, :], origins[..., 1:, None, :]
+    links = a + (b - a) * _SAMPLES[:, None]
+    links = links.reshape(*links.shape[:-3], links.shape[-3] * len(_SAMPLES), 3)
+    far = origins[..., 5, None, :]
+    wrist = np.concatenate([origins[..., 3:, :], cameras], axis=-2)
+    return np.stack(
+        [
+            _low(links, stage, _LINK) | _low(cameras, stage, _BLOCK),
+            _inside(links, stage, _LINK) | _inside(cameras, stage, _BLOCK),
+            (np.linalg.norm(np.concatenate([far, cameras], axis=-2)[..., :2], axis=-1) < _COLUMN).any(
+                axis=-1
+            ),
+            (_to_segment(wrist, origins[..., 0, :], origins[..., 1, :]) < 2 * _LINK).any(axis=-1)
+            | (_to_segment(cameras, origins[..., 1, :], origins[..., 2, :]) < _LINK + _BLOCK).any(axis=-1),
+        ],
+        axis=-1,
+    )
+
+
+def _low(points: Float64, stage: Stage, radius: float) -> NDArray[np.bool_]:
+    """Any of the points (..., N, 3) too close above the table."""
+    out: NDArray[np.bool_] = np.any(points[..., 2] < stage.table + radius + _TABLE_MARGIN, axis=-1)
+    return out
+
+
+def _inside(points: Float64, stage: Stage, radius: float) -> NDArray[np.bool_]:
+    """Any of the points (..., N, 3) inside the keep-out cylinder grown by a radius."""
+    aside = np.linalg.norm(points[..., :2] - stage.target[:2], axis=-1) < stage.keep_out_radius + radius
+    below = points[..., 2] < stage.table + stage.keep_out_height + radius
+    out: NDArray[np.bool_] = np.any(aside & below, axis=-1)
+    return out
+
+
+def _to_segment(points: Float64, a: Float64, b: Float64) -> Float64:
+    """(..., N) distance of points (..., N, 3) to the segments a-b (..., 3)."""
+    along = (b - a)[..., None, :]
+    offset = points - a[..., None, :]
+    t = np.clip((offset * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-12), 0, 1)
+    out: Float64 = np.linalg.norm(offset - t[..., None] * along, axis=-1)
+    return out
+
+
+def is_clear(model: ArmModel, rig: Rig, stage: Stage, start: Float64, goal: Float64) -> bool:
+    """Tell whether the straight way in joint space from (6,) to (6,) meets nothing."""
+    steps = max(2, int(np.ceil(np.abs(goal - start).max() / _STEP)) + 1)
+    path = start + (goal - start) * np.linspace(0, 1, steps)[:, None]
+    return not obstacles(model, rig, stage, path).any()
+
+
+def route(model: ArmModel, rig: Rig, stage: Stage, start: Float64, goal: Float64) -> list[Float64]:
+    """Goals (6,) to visit one after the other: straight if nothing is in the way, else by way of home.
+
+    Raises
+    ------
+    MotionRefused
+        When neither way is clear.
+    """
+    for way in ([goal], [stage.home, goal]):
+        if all(is_clear(model, rig, stage, a, b) for a, b in zip([start, *way], way, strict=False)):
+            return way
+    raise MotionRefused(
+        "no clear way to the next view, straight or by way of home",
+        hint="move the arm by hand to its home pose; check table, target and keep_out of [plan]",
+    )

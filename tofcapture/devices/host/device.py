@@ -1,0 +1,269 @@
+"""A driver in a child process, with the face of a driver."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+from tofcapture.devices.faults import ArmFault, HostLost
+from tofcapture.devices.host.child import make
+from tofcapture.devices.host.process import Host
+from tofcapture.errors import ConfigError, DeviceError
+
+if TYPE_CHECKING:
+    from tofcapture.devices.registry import StationContext
+    from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
+    from tofcapture.poses import Float64
+    from tofcapture.rig import Rig
+
+# Seconds; a driver's own deadlines are laid over them.
+DEADLINES = {
+    "__enter__": 12.0,
+    "__exit__": 2.0,
+    "state": 4.0,
+    "stop": 2.0,
+    "move_to": 300.0,
+    "capture": 60.0,
+    "equip": 4.0,
+}
+_GUARD = 3.0  # s beyond the deadline of opening; a child whose parent is silent for longer ends itself
+_PAUSES = (0.5, 1.0, 2.0)  # s before the first, second ... new child
+
+
+class HostedDevice:
+    """A driver that lives in a child process.
+
+    Parameters
+    ----------
+    name
+        Role, for messages.
+    target
+        ``module:name`` of the driver's factory, which takes (table, context). Its constructor does no I/O: it also runs here,
+        to answer ``describe``.
+    table, context
+        The device's table and its station. What devices share stays here.
+    deadlines
+        Seconds by verb, laid over :data:`DEADLINES`.
+    respawn
+        How often a lost child is replaced; 0 for arms, for which a person decides.
+    overdue
+        What it means for this device when a call exceeds its deadline.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        target: str,
+        table: Mapping[str, Any],
+        context: StationContext,
+        deadlines: Mapping[str, float],
+        respawn: int = 0,
+        overdue: type[ArmFault] = HostLost,
+    ) -> None:
+        self._name, self._overdue = name, overdue
+        self._left = self._respawn = respawn
+        self._local = make(target, table, context)
+        self._order = {"target": target, "table": dict(table), "context": replace(context, shared={})}
+        self._deadlines = {**DEADLINES, **deadlines}
+        self._host: Host | None = None
+        self._one = threading.Lock()
+
+    def __enter__(self) -> Self:
+        if self._host is not None and self._host.lost is None:
+            return self
+        if self._host is not None:
+            self._host.close()
+        self._left = self._respawn
+        try:
+            self._start()
+        except BaseException:
+            host, self._host = self._host, None
+            if host is not None:
+                host.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        host, self._host = self._host, None
+        if host is None:
+            return
+        try:
+            if host.lost is None:
+                host.call("__exit__", (None, None, None), self._deadlines["__exit__"])
+        except DeviceError:
+            if kind is None:
+                raise
+        finally:
+            host.close()
+
+    @property
+    def simulated(self) -> bool:
+        """What the driver says of itself."""
+        return bool(getattr(self._local, "simulated", False))
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the child, while it is open."""
+        return None if self._host is None else self._host.pid
+
+    def describe(self) -> Any:
+        """Ask the driver that lives here; nothing is opened."""
+        return self._local.describe()
+
+    def call(self, verb: str, *args: Any) -> Any:
+        """Call a method of the driver, one at a time.
+
+        Raises
+        ------
+        ArmFault
+            The child was lost or reported a state that needs a person; the same again until opened anew.
+        TofError
+            What the driver raised.
+        """
+        with self._one:
+            return self._do(verb, args)
+
+    def _do(self, verb: str, args: tuple[Any, ...]) -> Any:
+        host = self._living()
+        try:
+            return host.call(verb, args, self._deadlines.get(verb, 10.0))
+        except ArmFault as fault:
+            host.kill(fault)
+            raise
+
+    def _start(self) -> None:
+        guard = _GUARD + self._deadlines["__enter__"]
+        self._host = Host(self._name, self._order, guard, self._overdue)
+        try:
+            self._host.call("__enter__", (), self._deadlines["__enter__"], quiet=True)
+        except DeviceError as err:
+            self._host.kill(err)
+            raise
+        except BaseException:
+            self._host.kill(HostLost(f"{self._name}: not opened"))
+            raise
+
+    def _living(self) -> Host:
+        """The child; a new one if it was lost and may be replaced."""
+        if self._host is None:
+            raise DeviceError(f"{self._name} is not open", hint="use the station as a context manager")
+        while self._host.lost is not None:
+            if self._left == 0:
+                raise self._host.lost
+            time.sleep(_PAUSES[min(self._respawn - self._left, len(_PAUSES) - 1)])
+            self._left -= 1
+            self._host.close()
+            self._start()
+        return self._host
+
+
+class HostedArm(HostedDevice):
+    """An arm in a child process."""
+
+    def describe(self) -> ArmInfo:
+        """Say what this arm is, without opening it."""
+        info: ArmInfo = super().describe()
+        return info
+
+    def equip(self, rig: Rig) -> None:
+        """Tell the arm what it carries, for its checks of the way."""
+        if hasattr(self._local, "equip"):
+            self.call("equip", rig)
+
+    def state(self) -> ArmState:
+        """Measure the joints now."""
+        state: ArmState = self.call("state")
+        return state
+
+    def move_to(self, joints: Float64) -> ArmState:
+        """Move, wait until settled, return the measured state."""
+        state: ArmState = self.call("move_to", joints)
+        return state
+
+    def stop(self) -> None:
+        """Stop now, also in the middle of a move of another thread.
+
+        An arm that cannot be told has its process killed: the watchdog on the controller stops it then.
+        """
+        host = self._host
+        if host is None or host.lost is not None:
+            return
+        try:
+            host.call("stop", (), self._deadlines["stop"])
+        except DeviceError as err:
+            host.kill(err)
+
+
+class HostedTof(HostedDevice):
+    """A ToF camera in a child process."""
+
+    def describe(self) -> TofInfo:
+        """Say what this camera is, without opening it."""
+        info: TofInfo = super().describe()
+        return info
+
+    def capture(self, frames: int) -> TofBurst:
+        """Take a burst of ``frames`` static frames."""
+        burst: TofBurst = self.call("capture", frames)
+        return burst
+
+
+class HostedStereo(HostedDevice):
+    """A stereo camera in a child process."""
+
+    def describe(self) -> StereoInfo:
+        """Say what this camera is, without opening it."""
+        info: StereoInfo = super().describe()
+        return info
+
+    def capture(self) -> StereoFrame:
+        """Take one point map."""
+        frame: StereoFrame = self.call("capture")
+        return frame
+
+
+_KINDS: dict[str, tuple[type[HostedDevice], int]] = {
+    "arm": (HostedArm, 0),
+    "tof": (HostedTof, 3),
+    "stereo": (HostedStereo, 3),
+}
+
+
+def hosted(
+    role: str,
+    target: str,
+    deadlines: Mapping[str, float] | None = None,
+    overdue: type[ArmFault] = HostLost,
+) -> Callable[[Mapping[str, Any], StationContext], HostedDevice]:
+    """Make a factory, for ``DRIVERS``, of a driver that lives in a child process.
+
+    Parameters
+    ----------
+    role
+        ``arm``, ``tof`` or ``stereo``.
+    target
+        ``module:name`` of the driver's own factory. The module imports without the vendor's library.
+    deadlines
+        Seconds by verb, where the usual ones do not fit.
+    overdue
+        What it means for this device when a call exceeds its deadline.
+
+    Raises
+    ------
+    ConfigError
+        Another role.
+    """
+    if role not in _KINDS:
+        raise ConfigError(f"hosted driver: expected a role of {', '.join(_KINDS)}, got {role!r}")
+    kind, respawn = _KINDS[role]
+
+    def factory(table: Mapping[str, Any], context: StationContext) -> HostedDevice:
+        return kind(role, target, table, context, deadlines or {}, respawn, overdue)
+
+    return factory

@@ -1,0 +1,254 @@
+"""A Universal Robots arm, as it lives in the driver's process."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from tofcapture.devices.clearance import stage_of
+from tofcapture.devices.faults import ArmFault, NotReady
+from tofcapture.devices.kinematics import forward
+from tofcapture.devices.ur_rtde.link import Link, Sample
+from tofcapture.devices.ur_rtde.motion import ARRIVED, duration, follow, settle
+from tofcapture.devices.ur_rtde.probe import Controller, probe
+from tofcapture.devices.ur_rtde.settings import read_settings
+from tofcapture.devices.ur_rtde.way import check_goal, check_way
+from tofcapture.errors import ConfigError, MotionRefused
+from tofcapture.frames import ArmInfo, ArmState
+from tofcapture.poses import Float64, invert, rotation_angle, rotation_exp, transform
+
+if TYPE_CHECKING:
+    from tofcapture.devices.registry import StationContext
+    from tofcapture.rig import Rig
+
+_DECELERATION = 2.0  # rad/s^2 of a stop on request
+_MODEL_ERROR = (0.01, np.radians(1.5))  # m, rad; calibrated arms differ from nominal ones by 1 to 2 mm
+_PARENT = (2.0, 10.0)  # s of the station's silence that stop a motion, and an idle arm
+
+
+class UrArm:
+    """A UR arm behind ``ur_rtde``.
+
+    Parameters
+    ----------
+    table
+        See :class:`settings.Settings`.
+    context
+        The station; says whether motion is allowed, and where things stand.
+    """
+
+    simulated = False
+
+    def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
+        self._settings = read_settings(table)
+        self._context = context
+        self._link: Link | None = None
+        self._controller: Controller | None = None
+        self._rig: Rig | None = None
+        self._T_flange_tcp: Float64 = np.eye(4)
+        self._limits_known = False
+        self._stop, self._moving, self._closed = threading.Event(), False, threading.Event()
+        self._silence = 0.0
+        self._fault: ArmFault | None = None
+
+    def describe(self) -> ArmInfo:
+        """Model, and the serial number or the address of the station file."""
+        return ArmInfo(self._settings.model.name, self._settings.serial or self._settings.host)
+
+    def __enter__(self) -> Self:
+        """Probe, connect, check that this is the arm it should be. Nothing moves.
+
+        Raises
+        ------
+        ArmFault
+            The named state in which the controller is.
+        ConfigError
+            The arm's pose is not that of the model, or the library is missing.
+        """
+        self._controller = probe(self._settings)
+        self._closed.clear()
+        self._link = Link(self._settings.host, scaling=self._controller.scaling)
+        try:
+            self._prepare(self._link)
+        except BaseException:
+            self.__exit__(None, None, None)  # leave no script running on the controller
+            raise
+        threading.Thread(target=self._keep_alive, daemon=True).start()
+        return self
+
+    def _prepare(self, link: Link) -> None:
+        link.started()
+        self._T_flange_tcp = self._tcp()
+        sample = link.fresh()
+        self._check_model(sample)
+        # Where the arm stands is within the controller's limits; one that denies it knows none.
+        self._limits_known = self._within(sample.joints)
+        if not link.command("setWatchdog", 3.0, self._settings.watchdog_hz):
+            raise link.reason("setWatchdog")
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the script on the controller. The library's own farewell is left out: it crashes after a lost link.
+
+        The process is not needed after this; the library's objects stay, for their destructors hang and crash too.
+        """
+        self._closed.set()
+        if self._link is not None and self._link.playing and self._link.trouble() is None:
+            self._link.command("stopJ", 2.0, _DECELERATION)
+            self._link.command("stopScript", 2.0)
+
+    def equip(self, rig: Rig) -> None:
+        """Say what the arm carries; without it nothing moves."""
+        self._rig = rig
+
+    def state(self) -> ArmState:
+        """Measure the joints now, newer than this call."""
+        return self._state(self._opened().fresh())
+
+    def move_to(self, joints: Float64) -> ArmState:
+        """Check the way, move, wait until settled.
+
+        Raises
+        ------
+        MotionRefused
+            Motion is not allowed, the goal or the way is refused, or ``stop`` came.
+        NotSettled
+            The arm does not come to rest.
+        ArmFault
+            The named state in which the arm is now.
+        """
+        link = self._opened()
+        start = link.fresh()
+        goal = self._checked(start, joints)
+        self._stop.clear()
+        self._moving = True
+        try:
+            if np.abs(goal - start.joints).max() > ARRIVED:
+                self._go(link, start, goal)
+            return self._state(settle(link, self._settings.settle))
+        except ArmFault:
+            self._halt(link)
+            raise
+        finally:
+            self._moving = False
+
+    def stop(self) -> None:
+        """Stop now; an arm whose script has ended has stopped already."""
+        link = self._opened()
+        if link.playing:
+            link.command("stopJ", 4.0, _DECELERATION)
+
+    def interrupt(self) -> None:
+        """Make a running ``move_to`` stop; from another thread."""
+        self._stop.set()
+
+    def watch(self, silence: float) -> None:
+        """Look after link, safety and script; called a few times a second from another thread.
+
+        Parameters
+        ----------
+        silence
+            Seconds since the station gave a sign of life.
+
+        Raises
+        ------
+        ArmFault
+            What is wrong.
+        """
+        self._silence = silence
+        link = self._link
+        if link is None or self._closed.is_set():
+            return
+        if self._moving and silence > _PARENT[0]:
+            self._stop.set()
+        fault = self._fault or link.overdue()
+        if fault is None and not self._moving:  # a move reports its own faults, after stopping
+            fault = link.trouble()
+        if fault is not None and not self._closed.is_set():
+            raise fault
+
+    def _opened(self) -> Link:
+        if self._link is None or self._closed.is_set():
+            raise NotReady("the arm is not open", hint="use the station as a context manager")
+        return self._link
+
+    def _keep_alive(self) -> None:
+        """Feed the watchdog between calls, as long as the station lives."""
+        while not self._closed.wait(0.1):
+            if self._silence > _PARENT[1] or self._moving or self._link is None:
+                continue
+            try:
+                self._link.kick()
+            except ArmFault as fault:
+                self._fault = fault
+                return
+
+    def _tcp(self) -> Float64:
+        """(4, 4) pose of the active TCP on the flange: from the data if they have it, else asked."""
+        assert self._controller is not None
+        offset = self._controller.tcp_offset
+        if offset is None and self._settings.pose == "controller":
+            offset = tuple(self._opened().command("getTCPOffset", 3.0))
+        return np.eye(4) if offset is None or len(offset) != 6 else _matrix(np.array(offset))
+
+    def _check_model(self, sample: Sample) -> None:
+        """Refuse an arm that is not the model of the station file: every check of the way would be wrong."""
+        if self._settings.pose == "joints":
+            return
+        off = invert(forward(self._settings.model, sample.joints)) @ self._flange(sample)
+        shift, turn = float(np.linalg.norm(off[:3, 3])), rotation_angle(off[:3, :3])
+        if shift > _MODEL_ERROR[0] or turn > _MODEL_ERROR[1]:
+            raise ConfigError(
+                f"[arm] model {self._settings.model.name}: the controller's flange is {shift * 1e3:.0f} mm, "
+                f"{np.degrees(turn):.1f} deg from where this model's would be",
+                hint='correct [arm] model, or the TCP on the pendant; pose = "joints" does without the controller\'s pose',
+            )
+
+    def _flange(self, sample: Sample) -> Float64:
+        if self._settings.pose == "joints":
+            return forward(self._settings.model, sample.joints)
+        return _matrix(sample.pose) @ invert(self._T_flange_tcp)
+
+    def _state(self, sample: Sample) -> ArmState:
+        return ArmState(sample.joints, self._flange(sample), time.monotonic_ns())
+
+    def _within(self, joints: Float64) -> bool:
+        return bool(self._opened().command("isJointsWithinSafetyLimits", 3.0, joints.tolist()))
+
+    def _checked(self, start: Sample, joints: Float64) -> Float64:
+        if not self._context.allow_motion:
+            raise MotionRefused(
+                "motion was not allowed in this run",
+                hint="look at --dry-run, clear the workspace, then add --allow-motion",
+            )
+        if self._rig is None:
+            raise MotionRefused("the arm does not know what it carries", hint="open it as part of a station")
+        goal = check_goal(self._settings, start.joints, joints)
+        check_way(self._settings, self._rig, stage_of(self._context.config), start.joints, goal)
+        if self._limits_known and not self._within(goal):
+            raise MotionRefused("move: the controller's safety limits refuse the goal")
+        return goal
+
+    def _go(self, link: Link, start: Sample, goal: Float64) -> None:
+        settings = self._settings
+        if not link.command("moveJ", 5.0, goal.tolist(), settings.speed, settings.acceleration, True):
+            raise link.reason("moveJ")
+        seconds = duration(goal - start.joints, settings.speed, settings.acceleration)
+        if not follow(link, goal, seconds, self._stop):
+            self._halt(link)
+            raise MotionRefused("the motion was stopped on request")
+
+    def _halt(self, link: Link) -> None:
+        """Stop the arm if it can be told; one that cannot has its watchdog."""
+        if link.playing and link.seeing:
+            link.command("stopJ", 4.0, _DECELERATION)
+
+
+def _matrix(pose: Float64) -> Float64:
+    return transform(rotation_exp(pose[3:]), pose[:3])
