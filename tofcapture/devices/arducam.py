@@ -1,0 +1,210 @@
+"""The driver ``arducam``: an Arducam ToF module through its Python SDK, ``ArducamDepthCamera``; see docs/arducam.md for its limits.
+
+::
+
+    [tof]
+    driver = "arducam"
+    connection = "usb"
+    modulation_hz = [37.5e6, 37.5e6, 37.5e6, 37.5e6]
+    phase_rad = [0.0, 1.5707963267948966, 3.141592653589793, 4.71238898038469]
+    exposure = 400e-6
+    serial = "..."
+    [tof.camera]
+    ...
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.devices.host import hosted
+from tofcapture.errors import ConfigError, DeviceError, FormatError
+from tofcapture.files.info import tof_from
+from tofcapture.frames import TofBurst, TofInfo
+
+if TYPE_CHECKING:
+    from tofcapture.devices.registry import StationContext
+
+_SETTINGS = ("connection", "index")
+_REQUIRED = ("serial", "camera", "modulation_hz", "phase_rad", "exposure")
+_OPTIONAL = {
+    "model": "Arducam ToF",
+    "illuminator": [0.0, 0.0, 0.0],
+    "saturation": 4095.0,
+    "range_errors": [],
+}
+_REQUEST_MS = 2000
+_MISSES = 5  # frames in a row that may fail to come
+
+
+class Arducam:
+    """One Arducam ToF module, in RAW output.
+
+    Parameters
+    ----------
+    table
+        ``connection`` ("csi" or "usb"), ``index`` (default 0), and the module's description, because the SDK says neither its
+        modulation frequencies nor its phase steps: ``serial``, ``camera``, ``modulation_hz``, ``phase_rad``, ``exposure``; optionally
+        ``model``, ``illuminator``, ``saturation``, ``range_errors``.
+    context
+        The station; not needed.
+    """
+
+    def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
+        del context
+        self._info = _described(table)
+        self._connection, self._index = str(table.get("connection", "csi")), int(table.get("index", 0))
+        if self._connection not in ("csi", "usb"):
+            raise ConfigError(f'[tof] connection: expected "csi" or "usb", got {self._connection!r}')
+        self._stack: ExitStack | None = None
+        self._camera: Any = None
+
+    def __enter__(self) -> Self:
+        self._open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop and close the camera; again does nothing."""
+        stack, self._stack, self._camera = self._stack, None, None
+        if stack is not None:
+            stack.close()
+
+    def describe(self) -> TofInfo:
+        """Say what ``station.toml`` says of this camera; opens nothing."""
+        return self._info
+
+    def capture(self, frames: int) -> TofBurst:
+        """Take so many new frames.
+
+        Returns
+        -------
+        Burst with the host's monotonic time at which each frame was handed over, which is after its exposure, and NaN
+        temperatures: the SDK gives neither.
+
+        Raises
+        ------
+        ConfigError
+            Fewer than one frame.
+        DeviceError
+            Frames do not come, or are no stack of phase images; the next call opens the camera anew.
+        """
+        if frames < 1:
+            raise ConfigError(f"frames: expected at least 1, got {frames}")
+        try:
+            self._open()
+            self._frame()  # one may have been waiting since before the arm stood still
+            taken = [self._frame() for _ in range(frames)]
+        except DeviceError:
+            self.close()
+            raise
+        raw, times = zip(*taken, strict=True)
+        return TofBurst(np.stack(raw), np.array(times, dtype=np.int64), np.full(frames, np.nan), self._info)
+
+    def _open(self) -> None:
+        if self._camera is not None:
+            return
+        sdk = _sdk()
+        mode = sdk.Connection.CSI if self._connection == "csi" else sdk.Connection.USB
+        with ExitStack() as stack:
+            camera = sdk.ArducamCamera()
+            _succeed(camera.open(mode, self._index), f"open ({self._connection}, {self._index})")
+            stack.callback(camera.close)
+            _succeed(camera.start(sdk.FrameType.RAW), "start RAW")
+            stack.callback(camera.stop)
+            self._camera, self._stack = camera, stack.pop_all()
+
+    def _frame(self) -> tuple[NDArray[np.uint16], int]:
+        """One frame (K, H, W) and the host time (ns) when it was handed over."""
+        for _ in range(_MISSES):
+            frame = self._camera.requestFrame(_REQUEST_MS)
+            now = time.monotonic_ns()
+            if frame is None:
+                continue
+            try:
+                return _phases(frame, self._info), now
+            finally:
+                self._camera.releaseFrame(frame)
+        raise DeviceError(
+            f"Arducam: no frame in {_MISSES * _REQUEST_MS / 1e3:.0f} s",
+            hint="check its cable and its 5 V, 2 A supply",
+        )
+
+
+def _phases(frame: Any, info: TofInfo) -> NDArray[np.uint16]:
+    """Copy a frame's phase images (K, H, W) out of the SDK's memory.
+
+    Raises
+    ------
+    DeviceError
+        It is no RAW frame, or not a stack of K images of H x W.
+    """
+    data = getattr(frame, "raw_data", None)
+    if data is None:
+        raise DeviceError(
+            f"Arducam: expected a RAW frame, got {type(frame).__name__}: depth that the SDK computed cannot be recorded",
+            hint="see docs/arducam.md",
+        )
+    K, (H, W) = len(info.modulation_hz), info.camera.shape
+    array = np.asarray(data)
+    if array.shape not in ((K * H, W), (K, H, W)):
+        raise DeviceError(
+            f"Arducam: expected {K} phase images of {H} x {W} below each other, got a frame of shape {array.shape}",
+            hint="this module's RAW output is not the one described in [tof]; see docs/arducam.md",
+        )
+    out = array.reshape(K, H, W).astype(np.int32)
+    if out.min() < 0 or out.max() > 4095:
+        raise DeviceError(
+            f"Arducam: expected 12-bit values, got {out.min()} to {out.max()}", hint="see docs/arducam.md"
+        )
+    return out.astype(np.uint16)
+
+
+def _sdk() -> Any:
+    try:
+        import ArducamDepthCamera
+    except ImportError as err:
+        raise ConfigError(
+            f"the driver arducam needs the Python package ArducamDepthCamera: {err}",
+            hint="pip install ArducamDepthCamera, in an environment with numpy below 2",
+        ) from err
+    return ArducamDepthCamera
+
+
+def _succeed(code: Any, doing: str) -> None:
+    if int(code) != 0:
+        raise DeviceError(
+            f"Arducam: {doing}: {getattr(code, 'name', code)}",
+            hint="check its cable, its power, the overlay of the CSI port, and that no other program holds it",
+        )
+
+
+def _described(table: Mapping[str, Any]) -> TofInfo:
+    known = {*_SETTINGS, *_REQUIRED, *_OPTIONAL}
+    unknown, missing = table.keys() - known, [k for k in _REQUIRED if k not in table]
+    if unknown or missing:
+        raise ConfigError(
+            f"[tof] arducam: unknown: {', '.join(sorted(unknown)) or 'none'}; missing: {', '.join(missing) or 'none'}",
+            hint="see docs/arducam.md",
+        )
+    try:
+        info = tof_from({**_OPTIONAL, **table}, "[tof] arducam")
+    except FormatError as err:
+        raise ConfigError(err.message, hint="see docs/arducam.md") from err
+    if len(info.phase_rad) != len(info.modulation_hz):
+        raise ConfigError("[tof] arducam: expected one phase_rad for each modulation_hz")
+    return info
+
+
+DRIVERS = {"tof": hosted("tof", "tofcapture.devices.arducam:Arducam")}

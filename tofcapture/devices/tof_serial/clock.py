@@ -1,0 +1,51 @@
+"""The module's clock seen from the host: offset by the quickest of several round trips, drift from two of those.
+
+Cristian, "Probabilistic clock synchronization", Distributed Computing 3, 1989: the module read its clock somewhere between
+sending and receiving, so half the round trip bounds the error; the quickest round trip has the smallest bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+_PPM = 1e-6
+MOST_DRIFT = 500 * _PPM  # a bad crystal has 100
+_SPAN_NS = 2_000_000_000  # below this, drift drowns in the round trip's uncertainty
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """Both clocks at one moment.
+
+    Attributes
+    ----------
+    host_ns, module_us
+        Monotonic host clock, module clock.
+    error_ns
+        Bound of the error: half the round trip.
+    """
+
+    host_ns: int
+    module_us: int
+    error_ns: int
+
+
+def anchor(samples: Sequence[tuple[int, int, int]]) -> Anchor:
+    """Take the quickest of some round trips ``(sent_ns, module_us, received_ns)``."""
+    sent, module, received = min(samples, key=lambda s: s[2] - s[0])
+    return Anchor((sent + received) // 2, module, (received - sent + 1) // 2)
+
+
+def drift(first: Anchor, last: Anchor) -> float:
+    """Host seconds per module second minus one; zero while the two are too close to tell."""
+    host, module = last.host_ns - first.host_ns, 1000 * (last.module_us - first.module_us)
+    if module < max(_SPAN_NS, 20 * (first.error_ns + last.error_ns)):
+        return 0.0
+    return host / module - 1
+
+
+def to_host(near: Anchor, rate: float, module_us: int) -> int:
+    """Host time (ns) of a module time, from one anchor and the drift; one anchor for a burst keeps its spacing exact."""
+    step = 1000 * (module_us - near.module_us)
+    return near.host_ns + step + round(step * rate)
