@@ -59,6 +59,7 @@ def _run(args: argparse.Namespace) -> Outcome:
     data = {
         **paths,
         **summary,
+        **{key: evidence[key] for key in ("method", "sigma", "in_words") if key in evidence},
         **(evidence["truth"] or {}),
         "verdict": verdict(evidence),
         "values": rig_to_dict(rig),
@@ -95,12 +96,16 @@ def table(evidence: dict[str, Any]) -> str:
     """Lay the evidence out for a person: one line per pair, then spread, truth and verdict."""
     lines = ["view      rmse mm  inliers  rotation deg  translation mm  from the mean"]
     lines += [_row(pair) for pair in evidence["pairs"]]
-    lines.append(f"used {evidence['used']} of {evidence['views']} views, backend {evidence['backend']}")
+    lines.append(
+        f"used {evidence['used']} of {evidence['views']} views, backend {evidence['backend']}, {evidence.get('method', 'averaged')}"
+    )
     for name in ("spread", "standard_error"):
         value = evidence[name]
         lines.append(
             f"{name.replace('_', ' '):16}{value['rotation_deg']:.3f} deg  {value['translation_mm']:.2f} mm"
         )
+    if words := evidence.get("in_words"):
+        lines.append(words)
     if truth := evidence["truth"]:
         error = f"{truth['rotation_error_deg']:.3f} deg  {truth['translation_error_mm']:.2f} mm"
         lines.append(f"{'true error':16}{error} at 0.8 m")

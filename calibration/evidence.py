@@ -40,7 +40,8 @@ def evidence_of(
     Returns
     -------
     dict
-        JSON types only; lengths in metres but where a name ends in ``_mm``, angles in degrees.
+        JSON types only; lengths in metres but where a name ends in ``_mm``, angles in degrees. Spread and standard error are the
+        average's; methods with a covariance of their own put theirs in their place.
     """
     return {
         "format": "tofcapture-evidence",

@@ -86,6 +86,29 @@ def twist_about(motion: Float64, centre: Float64) -> Float64:
     return log(invert(W) @ motion @ W)
 
 
+def jackknife(left_out: Float64) -> tuple[Float64, Float64]:
+    """What leaving views out says of a result.
+
+    Parameters
+    ----------
+    left_out
+        (N, 6) results without each of the views in turn, as twists from any fixed transform near them.
+
+    Returns
+    -------
+    influence
+        (N, 6) how far each view alone departs from all: Tukey's pseudo-values about their mean.
+    covariance
+        (6, 6), widened by Student's t so that one sigma holds 68 % of the time however few the views are.
+    """
+    from scipy.stats import norm, t
+
+    n = len(left_out)
+    influence: Float64 = (n - 1) * (left_out.mean(axis=0) - left_out)
+    widened = float(t.ppf(norm.cdf(1.0), n - 1)) ** 2
+    return influence, widened * influence.T @ influence / (n * (n - 1))
+
+
 def _equations(
     T: Float64, transforms: Sequence[Float64], informations: Sequence[Float64]
 ) -> tuple[Float64, Float64, float]:

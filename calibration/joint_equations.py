@@ -28,9 +28,9 @@ FLOOR = 0.0007  # m, what is added to the noise of a range: fixed pattern and st
 RIM_SIGMA = 0.0004  # m, first guess; replaced by what the rims show
 RIM_MODES = 3
 SIDES = 4  # of the image: rims that end right, down, left, up
-# rad, one sigma by which rims of one side come out wrong in all views alike: a fiftieth of a ToF pixel. At the true rig the rims of
-# both cameras disagree by up to this much, side by side (36 views of the simulated seeds 0 to 2).
-INSET = 1e-4
+# rad, one sigma by which rims of one side come out wrong in all views alike, a hundredth of a ToF pixel: the root mean square, over
+# sides and ten stations that differ in rig, poses and surroundings, by which the rims of both cameras disagree at the true rig.
+INSET = 4e-5
 MODES = 10  # of a view's own range error over the image: the polynomials up to the third degree
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calibration.fusion import jackknife
 from calibration.joint_equations import (
     FINEST,
     INSET,
@@ -53,11 +54,13 @@ class JointSolution:
         (3,) working point, ToF frame, metres.
     covariance
         (6, 6) of the twist (rho, phi) about ``centre`` in ToF axes that moves the truth to the result: leave-one-view-out,
-        plus the priors' part and the rims' common inset.
+        widened for few views, plus the priors' part and the rims' common inset.
     information
         (6, 6) inverse of the covariance that the model itself predicts, nuisances eliminated.
     view_information
         (V, 6, 6) what each view adds to it with the nuisances held.
+    influence
+        (V, 6) twist by which each view alone departs from the others, as leaving it out shows.
     spreads
         Estimated sigmas of the views' own errors: per frequency the polynomial's coefficients, then the rims' shift.
     rms
@@ -73,6 +76,7 @@ class JointSolution:
     covariance: Float64
     information: Float64
     view_information: Float64
+    influence: Float64
     spreads: Float64
     rms: Float64
     matched: Float64
@@ -218,8 +222,7 @@ def _solution(
     g = sum(r[1] for r in reduced) - np.r_[np.zeros(6), prior * state.coefficients]
     free = slice(0, size - SIDES)
     jack = np.stack([np.linalg.solve((H - h)[free, free], (g - b)[free])[:6] for h, b in reduced])
-    jack -= jack.mean(axis=0)
-    n = len(views)
+    influence, varying = jackknife(jack)
     all_known = _inverse(H)
     predicted = np.asarray(np.linalg.inv(all_known[:6, :6]), dtype=np.float64)
     believed = all_known[:6, 6:] * prior @ all_known[6:, :6]
@@ -231,9 +234,10 @@ def _solution(
         coefficients=state.coefficients[:-SIDES],
         range_coefficients=storable,
         centre=state.centre,
-        covariance=(n - 1) / n * jack.T @ jack + believed + considered,
+        covariance=varying + believed + considered,
         information=predicted,
         view_information=np.stack([h[:6, :6] for h, _ in reduced]),
+        influence=influence,
         spreads=np.sqrt(state.variances),
         rms=np.array([e.rms for e in equations]),
         matched=np.array([e.matched for e in equations]),

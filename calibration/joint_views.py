@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.clouds import Cloud, range_sigma, stereo_cloud, surface_points, tof_depth
-from calibration.joint_rims import lit_rims, unveiled_rims
-from calibration.rims import Rims, rim_cloud
+from calibration.clouds import TOF_MARGIN, Cloud, dilate, range_sigma, stereo_cloud, surface_points, tof_depth
+from calibration.joint_rims import ACROSS, lit_rims, square_rims, unveiled_rims
+from calibration.rims import Rims
 from tofcapture.camera import Camera
 from tofcapture.frames import View
 from tofcapture.ops import phase
@@ -17,6 +17,7 @@ from tofcapture.poses import Float64
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError
 
 STRIDE = 5  # surface pixels skipped; thousands a view remain, and their common bias is not lowered by more
+RIM_BESIDE = TOF_MARGIN + ACROSS + 1  # px that a rim may lie off its board's trusted pixels
 HALO_RADII = (0.05, 0.15, 0.45)  # of the image width: narrow, middle and wide lens scattering
 
 
@@ -91,13 +92,14 @@ def joint_view_of(view: View, name: str) -> JointView:
         info.range_errors,
         float(np.mean(view.tof.celsius)),
     )
-    pixels = _pixels_of(surface_points(view.tof, depth)[::STRIDE], info.camera)
+    board = _pixels_of(surface_points(view.tof, depth), info.camera)
+    pixels = board[::STRIDE]
     hz = phase.frequencies(info.modulation_hz)
     rays = (info.camera.rays / info.camera.ray_lengths[..., None]).reshape(-1, 3)
     high_sigma = range_sigma(view.tof).reshape(-1)[pixels]
     relative = decoded.amplitude[-1] / decoded.amplitude
     sigma = [high_sigma * hz[-1] / f * r.reshape(-1)[pixels] for f, r in zip(hz, relative, strict=True)]
-    points = view.stereo.points
+    points, surface = view.stereo.points, stereo_cloud(view.stereo)
     return JointView(
         name=name,
         camera=info.camera,
@@ -109,10 +111,12 @@ def joint_view_of(view: View, name: str) -> JointView:
         sigma=np.stack(sigma),
         halos=halo_errors(phasor, hz).reshape(len(hz), -1, len(HALO_RADII))[:, pixels],
         celsius=float(np.mean(view.tof.celsius)),
-        rims=lit_rims(phasor, depth, info.camera, info.illuminator),
+        rims=_beside(lit_rims(phasor, depth, info.camera, info.illuminator), board, info.camera),
         factory=info.range_errors,
-        surface=stereo_cloud(view.stereo),
-        held=rim_cloud(unveiled_rims(points, view.stereo.info.camera), view.rig.T_stereo_tof[:3, 3]),
+        surface=surface,
+        held=square_rims(
+            unveiled_rims(points, view.stereo.info.camera), surface, view.rig.T_stereo_tof[:3, 3]
+        ),
         truth=None if view.truth is None else view.truth.T_tof_stereo,
     )
 
@@ -154,6 +158,14 @@ def _pixels_of(points: Float64, camera: Camera) -> NDArray[np.intp]:
         camera.fy * points[:, 1] / points[:, 2] + camera.cy,
     )
     return np.asarray(np.rint(v).astype(np.intp) * camera.width + np.rint(u).astype(np.intp))
+
+
+def _beside(rims: Rims, board: NDArray[np.intp], camera: Camera) -> Rims:
+    """Rims of the board alone: round things end where they are looked at from, not where they end."""
+    mask = np.zeros(camera.width * camera.height, dtype=bool)
+    mask[board] = True
+    near = dilate(mask.reshape(camera.shape), RIM_BESIDE).reshape(-1)[_pixels_of(rims.points, camera)]
+    return Rims(rims.points[near], rims.outward[near])
 
 
 def _same(image: NDArray[np.complex128], halo: Float64) -> NDArray[np.complex128]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibration.evidence import alignment_error
-from calibration.fusion import about, fuse
+from calibration.fusion import about, fuse, jackknife, twist_about
 from calibration.joint_icp import JointSolution, joint_icp
 from calibration.joint_views import JointView, joint_view_of
 from calibration.observability import observability, suggest_view
@@ -76,6 +76,9 @@ def apply_method(
     found = {"averaged": averaged, "weighted": weighted}
     extra: dict[str, Any] = {}
     rig = start
+    if method == "weighted":
+        influence, covariance = _left_out(solution, weighted)
+        extra = {"covariance": covariance.tolist(), **stated_uncertainty(influence, covariance)}
     if method == "joint":
         views = [_read(recording, pairs[i]) for i in solution.used]
         joint = joint_icp(views, averaged)
@@ -102,6 +105,7 @@ def joint_evidence(
     return {
         "working_point_m": joint.centre.tolist(),
         "covariance": joint.covariance.tolist(),
+        **stated_uncertainty(joint.influence, joint.covariance),
         "observability": {
             "eigenvalues": seen.eigenvalues.tolist(),
             "sigma_mm": seen.sigma_mm.tolist(),
@@ -124,8 +128,60 @@ def joint_evidence(
     }
 
 
-def _weighted(solution: Solution) -> Float64:
-    chosen = [solution.registrations[i] for i in solution.used]
+def stated_uncertainty(influence: Float64, covariance: Float64) -> dict[str, Any]:
+    """What a method's own covariance says, as JSON types.
+
+    Parameters
+    ----------
+    influence
+        (N, 6) of :func:`calibration.fusion.jackknife`.
+    covariance
+        (6, 6) of the twist about the working point, ToF axes.
+
+    Returns
+    -------
+    dict
+        ``spread`` of single views, ``standard_error``, ``sigma`` of each component, and the same ``in_words``.
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    return {
+        "spread": _lengths(np.square(influence).sum(axis=0) / (len(influence) - 1)),
+        "standard_error": _lengths(np.square(sigma)),
+        "sigma": {
+            "translation_mm": (1e3 * sigma[:3]).tolist(),
+            "rotation_deg": np.degrees(sigma[3:]).tolist(),
+        },
+        "in_words": _in_words(sigma),
+    }
+
+
+def _lengths(variances: Float64) -> dict[str, float]:
+    moved, turned = np.sqrt(variances[:3].sum()), np.sqrt(variances[3:].sum())
+    return {"rotation_deg": float(np.degrees(turned)), "translation_mm": float(1e3 * moved)}
+
+
+def _in_words(sigma: Float64) -> str:
+    moved = ", ".join(f"{1e3 * s:.2f} mm along {a}" for a, s in zip("xyz", sigma[:3], strict=True))
+    turned = ", ".join(f"{np.degrees(s):.3f} deg about {a}" for a, s in zip("xyz", sigma[3:], strict=True))
+    return (
+        f"The stereo camera's place in the ToF camera's axes is believed to {moved}, and to {turned} (one sigma: two times in "
+        "three the error is smaller), as seen at the working point."
+    )
+
+
+def _left_out(solution: Solution, fused: Float64) -> tuple[Float64, Float64]:
+    """Influence and covariance of the weighted fusion from leaving out each pair in turn."""
+    used = solution.used
+    back = invert(fused)
+    twists = [
+        twist_about(_weighted(solution, [i for i in used if i != out]) @ back, solution.working_point)
+        for out in used
+    ]
+    return jackknife(np.stack(twists))
+
+
+def _weighted(solution: Solution, used: Sequence[int] | None = None) -> Float64:
+    chosen = [solution.registrations[i] for i in (solution.used if used is None else used)]
     informations = [about(r.information, r.centre) for r in chosen]
     return fuse([invert(r.T_target_source) for r in chosen], informations).T
 

@@ -92,19 +92,25 @@ def rim_cloud(rims: Rims, seen_from: Float64) -> Cloud:
     Cloud
         The rims that are locally straight.
     """
+    tangents, straight, _ = rim_tangents(rims)
+    across = np.cross(tangents, rims.points - seen_from)
+    length = np.linalg.norm(across, axis=-1)
+    good = straight & (length > 0)
+    return Cloud(rims.points[good], across[good] / length[good, None])
+
+
+def rim_tangents(rims: Rims) -> tuple[Float64, NDArray[np.bool_], Float64]:
+    """Directions (N, 3) along which rims run, of either sign, which (N,) are straight, and how far (N, 3) they lie off their neighbours."""
     from scipy.spatial import cKDTree
 
     if len(rims.points) <= TANGENT_NEIGHBOURS:
-        return Cloud(np.zeros((0, 3)), np.zeros((0, 3)))
+        return np.zeros_like(rims.points), np.zeros(len(rims.points), dtype=bool), np.zeros_like(rims.points)
     _, neighbours = cKDTree(rims.points).query(rims.points, TANGENT_NEIGHBOURS)
     near = rims.points[neighbours]
     centred = near - near.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))
-    straight = values[:, 1] < STRAIGHT**2 * values[:, 2]
-    across = np.cross(vectors[:, :, 2], rims.points - seen_from)
-    length = np.linalg.norm(across, axis=-1)
-    good = straight & (length > 0)
-    return Cloud(rims.points[good], across[good] / length[good, None])
+    off: Float64 = rims.points - near.mean(axis=1)
+    return vectors[:, :, 2], values[:, 1] < STRAIGHT**2 * values[:, 2], off
 
 
 def _tof_steps(

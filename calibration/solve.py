@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.align_diagnosis import check_start, explained
 from calibration.averaged_icp import Average, average_transforms
 from calibration.backends import COARSE_TO_FINE, FINE, backend_named, register
 from calibration.evidence import evidence_of, write_atomically, write_evidence
@@ -19,7 +20,7 @@ from calibration.pairs import Pair, calibration_views, load_pair
 from calibration.pinned import pinned_worker
 from calibration.range_residual import RangeResidual, fit_range_residual, no_residual
 from calibration.registration import Refusal, Registration, check_registration
-from tofcapture.errors import DataError, QualityError
+from tofcapture.errors import DataError, QualityError, TofError
 from tofcapture.poses import Float64, invert
 from tofcapture.rig import Rig, dumps_rig
 
@@ -27,6 +28,14 @@ MIN_PAIRS = 3  # below this no pair can be told from an outlier
 REFINEMENTS = 2  # rounds of range residual and registration after the first; a third changes 0.1 mm
 
 Progress = Callable[[str, int, int], None]
+
+
+class RefusedPairsError(QualityError):
+    """Too few pairs passed the gate; ``refusals`` says why which did not."""
+
+    def __init__(self, message: str, hint: str, refusals: Sequence[Refusal | None]) -> None:
+        super().__init__(message, hint)
+        self.refusals = list(refusals)
 
 
 @dataclass(frozen=True)
@@ -96,11 +105,11 @@ def align(
     Raises
     ------
     DataError
-        No calibration views, unreadable ones, or views of different cameras.
+        No calibration views, unreadable ones, views of different cameras, in millimetres, mirrored or blind.
     ConfigError
-        Unknown backend, or its library is missing.
+        Unknown backend, or its library is missing; an initial guess in millimetres or swapped.
     QualityError
-        Fewer than three pairs pass the gate; nothing is written then.
+        Fewer than three pairs pass the gate, with the likely cause; nothing is written then.
     """
     backend_named(backend)
     method_named(method)
@@ -112,7 +121,11 @@ def align(
         progress("reading", i, len(paths))
         pairs.append(load_pair(recording, path))
     start = _common_rig(pairs) if initial is None else initial
-    solution = solve(pairs, backend, start.T_tof_stereo, progress)
+    check_start(start.T_tof_stereo)
+    try:
+        solution = solve(pairs, backend, start.T_tof_stereo, progress)
+    except RefusedPairsError as err:
+        raise _explained(err, recording, pairs, backend, invert(start.T_tof_stereo)) from None
     aligned = apply_method(method, recording, pairs, solution, start)
     rig = aligned.rig
     evidence = evidence_of(pairs, solution, backend, start.T_tof_stereo, rig.T_tof_stereo) | aligned.evidence
@@ -154,6 +167,19 @@ def solve(
             residual = _next_residual(pairs, solution)
             solution = run.round([p.corrected(residual) for p in pairs], solution.average.T, FINE, residual)
     return solution
+
+
+def _explained(
+    error: RefusedPairsError, recording: Path, pairs: Sequence[Pair], backend: str, guess: Float64
+) -> TofError:
+    with pinned_worker() as worker:
+
+        def again(pair: Pair, T_start: Float64) -> Registration:
+            return worker.submit(
+                register, backend, pair.source, pair.target, T_start, COARSE_TO_FINE
+            ).result()
+
+        return explained(error, recording, pairs, error.refusals, guess, again)
 
 
 def _next_residual(pairs: Sequence[Pair], solution: Solution) -> RangeResidual:
@@ -219,9 +245,10 @@ def _demand(good: int, refusals: Sequence[Refusal | None]) -> None:
         ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
         or "no other failed the gate"
     )
-    raise QualityError(
+    raise RefusedPairsError(
         f"expected at least {MIN_PAIRS} good calibration pairs, got {good} of {len(refusals)}: {listed}",
-        hint="record more board views, tilted 15 to 40 degrees in all directions, or pass a better --initial rig.toml",
+        "record more board views, tilted 15 to 40 degrees in all directions, or pass a better --initial rig.toml",
+        refusals,
     )
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from calibration.clouds import Cloud
-from calibration.fusion import about, fuse, twist_about
+from calibration.fusion import about, fuse, jackknife, twist_about
 from calibration.joint_icp import joint_icp
-from calibration.joint_rims import _shares
+from calibration.joint_rims import _continued, _shares, square_rims
 from calibration.joint_views import HALO_RADII, JointView, halo_errors
 from calibration.methods import joint_evidence, method_named
 from calibration.observability import motion_name, observability, plane_information, suggest_view
@@ -219,10 +219,48 @@ def test_shadowed_pixel_has_no_less_front():
     """A pixel of front, back and dark gives the front's share, and says that the rest is dark."""
     front, back = np.array([[2.0 + 1j], [0.5 - 1j]]), np.array([[0.4 - 0.3j], [0.6 + 0.8j]])
     mixed = 0.3 * front + 0.5 * back
-    share, lit, apart = _shares(mixed[..., None], front, back)
+    share, lit, apart = _shares(mixed[..., None], front[..., None], back)
     assert share[0, 0] == pytest.approx(0.3)
     assert lit[0, 0] == pytest.approx(0.8)
     assert apart[0] > 0.15
+
+
+def test_front_that_darkens_outward_keeps_its_width():
+    """A front whose light falls by a percent a pixel is continued as it falls: its share of the mixed pixels is exact."""
+    log = np.array([[-0.01 + 0.012j], [-0.01 + 0.06j]])
+    front = np.exp(log * np.arange(-3, 4))[:, None, :] * np.array([2.0, 1.5j])[:, None, None]
+    back = np.array([[0.4 - 0.3j], [0.6 + 0.8j]])
+    across = np.stack([front[:, :, 4], 0.3 * front[:, :, 5] + 0.7 * back, back], axis=-1)
+    z = np.concatenate([front[:, 0, :4], across[:, 0]], axis=-1)[:, None]
+    share, _, _ = _shares(across, _continued(z, np.array([0]), np.array([3])), back)
+    np.testing.assert_allclose(share[0], [1.0, 0.3, 0.0], atol=1e-12)
+
+
+def test_rims_whose_cut_is_seen_are_dropped():
+    """Of a slit's two sides, only that whose cut turns away from both cameras is kept, with its normal across rim and ray."""
+    y = np.linspace(-0.1, 0.1, 400)
+    normal = poses.rotation_exp([0.0, 0.5, 0.0]) @ [0.0, 0.0, -1.0]
+    along = np.cross([0.0, 1.0, 0.0], normal)
+    along *= np.sign(along[0])
+    side = [
+        np.array([0, 0, 0.8]) + k * 0.05 * along + y[:, None] * np.array([0.0, 1.0, 0.0]) for k in (-1, 1)
+    ]
+    rims = Rims(np.concatenate(side), np.repeat([[1.0, 0, 0], [-1.0, 0, 0]], len(y), axis=0))
+    a, b = np.meshgrid(np.linspace(-0.2, 0.2, 60), np.linspace(-0.2, 0.2, 60))
+    points = np.array([0, 0, 0.8]) + a.reshape(-1, 1) * along + b.reshape(-1, 1) * np.array([0.0, 1.0, 0.0])
+    held = square_rims(rims, Cloud(points, np.tile(normal, (len(points), 1))), np.array([0.05, -0.08, 0.0]))
+    receding = side[0] if along[2] > 0 else side[1]
+    assert len(held) > 300
+    assert np.abs((held.points[:, None] - receding[None, ::20]) @ along).max() < 1e-9
+    assert np.abs((held.normals * (held.points - [0.05, -0.08, 0.0])).sum(axis=-1)).max() < 1e-12
+
+
+def test_jackknife_is_the_covariance_of_a_mean():
+    """For a mean it gives the sample covariance over N, widened by Student's t, and the views' departures."""
+    x = np.random.default_rng(7).standard_normal((9, 6))
+    influence, covariance = jackknife(np.stack([np.delete(x, i, axis=0).mean(axis=0) for i in range(9)]))
+    np.testing.assert_allclose(influence, x - x.mean(axis=0))
+    np.testing.assert_allclose(covariance, 1.0669**2 * np.cov(x.T) / 9, rtol=1e-3)
 
 
 def test_halo_lengthens_a_dark_front_before_a_bright_back():

@@ -151,9 +151,11 @@ def _uncertainty(evidence: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def _observability(evidence: Mapping[str, Any]) -> dict[str, str] | None:
     found = evidence.get("observability")
-    if not isinstance(found, Mapping):
-        return None
-    return {str(key).replace("_", " "): _text(value) for key, value in found.items()}
+    words = evidence.get("in_words")
+    rows = {"in plain words": str(words)} if words else {}
+    if isinstance(found, Mapping):
+        rows |= {str(key).replace("_", " "): _text(value) for key, value in found.items()}
+    return rows or None
 
 
 def _text(value: Any) -> str:
