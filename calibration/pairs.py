@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.clouds import Cloud, stereo_cloud, surface_points, tof_depth
+from calibration.projective.organised import OrganisedCloud
 from calibration.range_residual import RangeResidual
 from calibration.rims import REPEAT, rim_cloud, stereo_rims, tof_rims
 from tofcapture.errors import DataError
@@ -32,7 +33,7 @@ class Pair:
     source
         (N, 3) ToF points, ToF frame, metres: rims, each repeated ``REPEAT`` times as no library takes weights, then surface.
     target
-        Rims and dense cloud of the stereo camera with normals, stereo frame.
+        Rims and dense cloud of the stereo camera with normals, stereo frame, with the image that they come from.
     rig
         The rig as it was known when the view was taken.
     modulation_hz
@@ -83,8 +84,11 @@ def pair_of(view: View, name: str, sha256: str) -> Pair:
         name=name,
         sha256=sha256,
         source=np.concatenate([rims, surface_points(view.tof, depth)]),
-        target=Cloud(
-            np.concatenate([held.points, dense.points]), np.concatenate([held.normals, dense.normals])
+        target=OrganisedCloud(
+            np.concatenate([held.points, dense.points]),
+            np.concatenate([held.normals, dense.normals]),
+            np.asarray(view.stereo.points[..., 2], dtype=np.float32).copy(),
+            view.stereo.info.camera,
         ),
         rig=view.rig,
         modulation_hz=max(info.modulation_hz),

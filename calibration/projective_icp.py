@@ -13,12 +13,14 @@ The distance to the tangent plane is ``e = (n . d) (measured - predicted)``, wit
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.projective.grid import GRAZING, SurfaceGrid
+from calibration.clouds import WORKING_DEPTH
+from calibration.projective.coarse import coarse
+from calibration.projective.edges import StereoEdges, TofEdges, match_edges, tof_edges
+from calibration.projective.grid import SurfaceGrid
 from calibration.projective.newton import (
     Match,
     moved,
@@ -27,51 +29,24 @@ from calibration.projective.newton import (
     robust_scale,
     tukey,
 )
+from calibration.projective.rays import Rays, match_rays, predicted_reach, rays_of
 from calibration.registration import INLIER_DISTANCE, MIN_POINTS, Registration
 from tofcapture.errors import DataError
-from tofcapture.poses import Float64, transform
+from tofcapture.poses import Float64
 from tofcapture.rig import SPEED_OF_LIGHT
 
 COARSE = (0.080, 0.040, 0.020)  # m, kernel scales from a guess that is off by centimetres
 COARSE_POINTS = 6000  # rays of the coarse stages, evenly picked
-COARSE_STEPS, FINE_STEPS = 15, 20  # most Newton steps of a stage
-COARSE_STOP, FEW_STOP, FINE_STOP = (
-    5e-4,
-    1e-4,
-    1e-5,
-)  # m and rad; a stage ends when its step is shorter in both
-SCAN = (
-    -0.08,
-    -0.04,
-    0.0,
-    0.04,
-    0.08,
-)  # m, shifts across the view that are tried once the large planes coincide
-SCAN_POINTS = 1500
-SCAN_GATE = 0.040  # m, kernel scale of the trial
-SCAN_GAIN = 0.95  # a shift must leave so much less unexplained
+FINE_STEPS = 20  # most Newton steps of a stage
+FEW_STOP, FINE_STOP = 1e-4, 1e-5  # m and rad; a stage ends when its step is shorter in both
 FINE_GATE = 0.020  # m; residuals beyond it take no part in the last stage, whatever its scale
 TUKEY = (
     4.685  # kernel scale in standard deviations: 95 % efficient on Gaussian noise (Holland and Welsch 1977)
 )
-STEREO_SIGMA = 0.0005  # m, of a tangent plane: stereo noise and what the quadratic leaves out
-RELATIVE_SIGMA = 0.004  # range noise over range, where the caller knows no better
-
-
-@dataclass(frozen=True)
-class _Rays:
-    """Measured rays: unit directions (3, N) in the ToF frame, lengths (N,) and their standard deviations (N,), metres."""
-
-    directions: Float64
-    lengths: Float64
-    sigma: Float64
-
-    def some(self, count: int) -> _Rays:
-        """Evenly picked rays, about ``count`` of them."""
-        step = max(len(self.lengths) // count, 1)
-        return _Rays(
-            np.ascontiguousarray(self.directions[:, ::step]), self.lengths[::step], self.sigma[::step]
-        )
+MIN_SCALE = (
+    0.1  # of the noise model; a kernel that shrinks with exact data would hold on to wherever it starts
+)
+EDGE_KERNELS = (0.004, 0.001)  # m, Tukey's scale on depth edges: while the pose settles, and at the end
 
 
 def range_sigma_of(amplitude: ArrayLike, modulation_hz: float, noise: float) -> Float64:
@@ -96,23 +71,27 @@ def register_projective(
     initial: Float64,
     sigma: ArrayLike | None = None,
     distances: Sequence[float] = COARSE,
+    edges: StereoEdges | None = None,
 ) -> Registration:
     """Register ToF points into a stereo surface.
 
     Parameters
     ----------
     source
-        (N, 3) finite points in the frame of the ToF camera, whose centre is the origin, metres. Flying pixels need not be
-        removed: the kernel refuses them.
+        (N, 3) finite points in the frame of the ToF camera, whose centre is the origin, metres; or its image (H, W, 3) with NaN
+        where nothing was measured. Flying pixels need not be removed: the kernel refuses them.
     grid
         From :func:`calibration.projective.grid.surface_grid`.
     initial
         (4, 4) ``T_stereo_tof`` to start from; 3 degrees and 3 cm are near enough on scenes with relief.
     sigma
-        (N,) or a number: standard deviation of the range noise, metres; a common factor is measured on the residuals. By
+        (N,), (H, W) or a number: standard deviation of the range noise, metres; a common factor is measured on the residuals. By
         default 0.4 % of the range.
     distances
         Kernel scales of the coarse stages, metres, descending; empty from a guess that is good to millimetres.
+    edges
+        From :func:`calibration.projective.edges.stereo_edges`; they need the ToF points as an image, and hold the pose across the
+        view where surfaces hold little.
 
     Returns
     -------
@@ -124,117 +103,77 @@ def register_projective(
     Raises
     ------
     DataError
-        When source is not (N, 3) finite, or sigma is not positive.
+        When source is neither (N, 3) finite nor an image, sigma is not positive, or edges come with points that are no image.
     """
-    rays = _rays(source, sigma)
+    held = _edges_of(source, edges)
+    rays = rays_of(*_flat(source, sigma))
     T = np.asarray(initial, dtype=np.float64)
     if min(len(rays.lengths), int(grid.smooth.sum())) < MIN_POINTS:
         return _nothing(T, 0, 0.0)
-    few = rays.some(COARSE_POINTS)
-    for distance in distances[:1]:
-        T = _coarse_stage(few, grid, T, distance)
-        T = _shifted(rays.some(SCAN_POINTS), grid, T)
-    for distance in distances:
-        T = _coarse_stage(few, grid, T, distance)
-    T, _ = _fine_stage(few, grid, T, FEW_STOP)
-    T, match = _fine_stage(rays, grid, T, FINE_STOP)
-    return _measured(rays, match, T)
+    few = rays.nearer(WORKING_DEPTH[1]).some(COARSE_POINTS)
+    if distances:
+        T = coarse(few, grid, T, distances)
+    T, _ = _fine_stage(few, grid, T, FEW_STOP, held, EDGE_KERNELS[0])
+    T, match = _fine_stage(rays, grid, T, FINE_STOP, held, EDGE_KERNELS[1])
+    return _measured(rays, match, T, held)
 
 
-def _rays(source: NDArray[np.floating], sigma: ArrayLike | None) -> _Rays:
-    if source.ndim != 2 or source.shape[1] != 3 or not np.isfinite(source).all():
-        raise DataError(f"source points: expected finite (N, 3), got shape {source.shape}")
-    points = np.ascontiguousarray(source.T, dtype=np.float64)
-    lengths = np.sqrt(points[0] ** 2 + points[1] ** 2 + points[2] ** 2)
-    if not (lengths > 0).all():
+_Edges = tuple[TofEdges, StereoEdges] | None
+
+
+def _edges_of(source: NDArray[np.floating], edges: StereoEdges | None) -> _Edges:
+    if edges is None:
+        return None
+    if source.ndim != 3:
         raise DataError(
-            "source points: expected none at the camera's centre",
-            hint="mark missing pixels by NaN and drop them",
+            f"source points: expected an image (H, W, 3) to find edges in, got shape {source.shape}",
+            hint="leave edges out, or keep the missing pixels as NaN",
         )
-    spread = RELATIVE_SIGMA * lengths if sigma is None else np.asarray(sigma, dtype=np.float64)
-    if spread.shape not in {(), lengths.shape} or not (np.isfinite(spread) & (spread > 0)).all():
-        raise DataError(
-            f"sigma: expected a positive number or {lengths.shape} of them, got shape {spread.shape}"
-        )
-    return _Rays(points / lengths, lengths, np.broadcast_to(spread, lengths.shape))
+    return tof_edges(source), edges
 
 
-def _match(rays: _Rays, grid: SurfaceGrid, T: Float64, reach: Float64, gate: float) -> Match:
-    """Cut the rays with the tangent planes at their predicted ends (N,) and keep residuals within the gate."""
-    o = T[:3, 3]
-    d = np.einsum("ij,jn->in", T[:3, :3], rays.directions)
-    planes = grid.planes_at(o[:, None] + reach * d)
-    n = planes.normals
-    cosine = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
-    steep = cosine < GRAZING
-    predicted = (planes.offsets - (n[0] * o[0] + n[1] * o[1] + n[2] * o[2])) / np.where(steep, 1.0, cosine)
-    distance = cosine * (rays.lengths - predicted)
-    met = np.flatnonzero(planes.found & ~steep & (np.abs(distance) < gate))
-    predicted, cosine = predicted[met], cosine[met]
-    return Match(
-        rays=met,
-        points=o[:, None] + predicted * d[:, met],
-        normals=n[:, met],
-        distance=distance[met],
-        variance=(cosine * rays.sigma[met]) ** 2 + STEREO_SIGMA**2,
-        reach=predicted,
-    )
+def _flat(
+    source: NDArray[np.floating], sigma: ArrayLike | None
+) -> tuple[NDArray[np.floating], ArrayLike | None]:
+    """Points (N, 3) and their noise of an image; what is no image stays as it is."""
+    if source.ndim != 3 or source.shape[2] != 3:
+        return source, sigma
+    seen = np.isfinite(source).all(axis=-1)
+    return source[seen], sigma if sigma is None or np.ndim(sigma) == 0 else np.broadcast_to(
+        sigma, seen.shape
+    )[seen]
 
 
-def _predicted(match: Match, otherwise: Float64) -> Float64:
-    """Where to look next: the predicted end of each ray, ``otherwise`` (N,) where nothing was met."""
-    reach = otherwise.copy()
-    reach[match.rays] = match.reach
-    return reach
-
-
-def _coarse_stage(rays: _Rays, grid: SurfaceGrid, T: Float64, distance: float) -> Float64:
-    reach = rays.lengths
-    for _ in range(COARSE_STEPS):
-        match = _match(rays, grid, T, reach, distance)
-        if len(match.rays) < MIN_POINTS:
-            break
-        step, centre = _step(match, tukey(match.distance / distance) / match.variance)
-        T = moved(T, step, centre)
-        if np.abs(step).max() < COARSE_STOP:
-            break
-        reach = _predicted(match, rays.lengths)
-    return T
-
-
-def _shifted(rays: _Rays, grid: SurfaceGrid, T: Float64) -> Float64:
-    """Move the transform across the view to where the surface explains clearly more rays, if there is such a place.
-
-    Once the large planes coincide, sliding along them is the one local minimum that coarse to fine does not leave.
-    """
-
-    def cost(x: float, y: float) -> tuple[float, Float64]:
-        there = transform(np.eye(3), [x, y, 0.0]) @ T
-        match = _match(rays, grid, there, rays.lengths, SCAN_GATE)
-        explained = np.sum(tukey(match.distance / SCAN_GATE))
-        return 1 - float(explained) / len(rays.lengths), there
-
-    here = cost(0.0, 0.0)[0]
-    best, there = min((cost(x, y) for x in SCAN for y in SCAN), key=lambda found: found[0])
-    return there if best < SCAN_GAIN * here else T
-
-
-def _fine_stage(rays: _Rays, grid: SurfaceGrid, T: Float64, stop: float) -> tuple[Float64, Match]:
+def _fine_stage(
+    rays: Rays, grid: SurfaceGrid, T: Float64, stop: float, held: _Edges, kernel: float
+) -> tuple[Float64, Match]:
     """Iterate to the end; a ray that meets nothing looks again where it looked last, and comes back if the pose does."""
     reach, before = rays.lengths, np.zeros(6)
-    match = _match(rays, grid, T, reach, FINE_GATE)
+    match = match_rays(rays, grid, T, reach, FINE_GATE)
     for _ in range(FINE_STEPS):
         if len(match.rays) < MIN_POINTS:
             break
-        step, centre = _step(match, _weights(match))
+        H, g, centre = _equations(match, T, held, kernel)
+        step = newton_step(H, g)
         if np.sum(step * before) < 0:
             step = step / 2  # rays at edges come and go and send the pose back and forth; halving ends that
         T, before = moved(T, step, centre), step
-        reach = _predicted(match, reach)
-        match = _match(rays, grid, T, reach, FINE_GATE)
+        reach = predicted_reach(match, reach)
+        match = match_rays(rays, grid, T, reach, FINE_GATE)
         if np.abs(step).max() < stop:
             break
     return T, match
+
+
+def _equations(match: Match, T: Float64, held: _Edges, kernel: float) -> tuple[Float64, Float64, Float64]:
+    """Normal equations of surfaces and edges, and the point that they turn about."""
+    centre = match.points.mean(axis=1)
+    H, g = normal_equations(match, _weights(match) / _scale(match) ** 2, centre)
+    if held is None:
+        return H, g, centre
+    found, weights = match_edges(*held, T, kernel)
+    H_edge, g_edge = normal_equations(found, weights, centre)
+    return H + H_edge, g + g_edge, centre
 
 
 def _weights(match: Match) -> Float64:
@@ -243,7 +182,7 @@ def _weights(match: Match) -> Float64:
 
 
 def _scale(match: Match) -> float:
-    return max(robust_scale(match.distance / np.sqrt(match.variance)), 1e-9)
+    return max(robust_scale(match.distance / np.sqrt(match.variance)), MIN_SCALE)
 
 
 def _step(match: Match, weights: Float64) -> tuple[Float64, Float64]:
@@ -251,24 +190,31 @@ def _step(match: Match, weights: Float64) -> tuple[Float64, Float64]:
     return newton_step(*normal_equations(match, weights, centre)), centre
 
 
-def _measured(rays: _Rays, match: Match, T: Float64) -> Registration:
+def _measured(rays: Rays, match: Match, T: Float64, held: _Edges) -> Registration:
     """State what the last transform achieves, as :func:`calibration.registration.measure_registration` does."""
     near = np.abs(match.distance) < INLIER_DISTANCE
     inliers = int(near.sum())
     fitness = inliers / len(rays.lengths)
     if inliers < MIN_POINTS:
         return _nothing(T, inliers, fitness)
+    H, g, about = _equations(match, T, held, EDGE_KERNELS[1])
     centre = match.points[:, near].mean(axis=1)
-    H, g = normal_equations(match, _weights(match), centre)
+    information, even = _information(match, centre), normal_equations(match, near / 1.0, centre)[0]
+    if held is not None:
+        found, weights = match_edges(*held, T, EDGE_KERNELS[1])
+        information = information + normal_equations(found, weights, centre)[0]
+        even = even + normal_equations(found, np.ones(len(found.rays)), centre)[0]
+    step = newton_step(H, g)
+    step[:3] += np.cross(step[3:], centre - about)
     return Registration(
         T_target_source=T,
         inliers=inliers,
         rmse=float(np.sqrt(np.mean(np.square(match.distance[near])))),
         fitness=fitness,
-        information=_information(match, centre),
-        condition=_condition(match, near, centre),
+        information=information,
+        condition=_condition(even / inliers, match.points[:, near], centre),
         centre=centre,
-        step=newton_step(H, g),
+        step=step,
     )
 
 
@@ -288,10 +234,9 @@ def _information(match: Match, centre: Float64) -> Float64:
     return efficiency * H
 
 
-def _condition(match: Match, near: NDArray[np.bool_], centre: Float64) -> float:
+def _condition(H: Float64, points: Float64, centre: Float64) -> float:
     """Condition number of the unweighted normal matrix, rotations as motion at the mean radius; as of any backend."""
-    H, _ = normal_equations(match, near / 1.0, centre)
-    radius = np.sqrt(np.mean(np.square(match.points[:, near] - centre[:, None]).sum(axis=0)))
+    radius = np.sqrt(np.mean(np.square(points - centre[:, None]).sum(axis=0)))
     even = np.repeat([1, 1 / radius], 3)
-    values = np.linalg.eigvalsh(H * even * even[:, None] / near.sum())
+    values = np.linalg.eigvalsh(H * even * even[:, None])
     return float(values[-1] / values[0]) if values[0] > 1e-15 else np.inf

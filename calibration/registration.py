@@ -107,13 +107,22 @@ def residuals(source: Float64, target: Cloud, T_target_source: Float64) -> Resid
     """
     from scipy.spatial import cKDTree
 
-    moved = transform_points(T_target_source, source)
-    distance, partner = cKDTree(target.points).query(moved, distance_upper_bound=INLIER_DISTANCE)
+    once, count = runs(source)
+    moved = transform_points(T_target_source, source[once])
+    tree = cKDTree(target.points, balanced_tree=False, compact_nodes=False)
+    distance, partner = tree.query(moved, distance_upper_bound=INLIER_DISTANCE)
+    moved, distance, partner = (np.repeat(x, count, axis=0) for x in (moved, distance, partner))
     matched = np.flatnonzero(np.isfinite(distance))
     partner = partner[matched]
     normals = target.normals[partner]
     signed = ((moved[matched] - target.points[partner]) * normals).sum(axis=-1)
     return Residuals(matched, moved[matched], normals, signed)
+
+
+def runs(points: Float64) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Where runs of equal points (N, 3) start, and how long they are: points are repeated to weigh more."""
+    starts = np.flatnonzero(np.concatenate([[True], (points[1:] != points[:-1]).any(axis=1)]))
+    return starts, np.diff(np.append(starts, len(points)))
 
 
 def jacobian(found: Residuals, centre: Float64) -> Float64:

@@ -13,8 +13,10 @@ import pytest
 
 from calibration.backends import register
 from calibration.clouds import Cloud
+from calibration.projective.edges import match_edges, stereo_edges, tof_edges
 from calibration.projective.grid import surface_grid
 from calibration.projective.newton import Match, moved, newton_step, normal_equations, tukey
+from calibration.projective.organised import OrganisedCloud
 from calibration.projective_icp import range_sigma_of, register_projective
 from calibration.registration import MIN_POINTS, Refusal, check_registration
 from tofcapture import poses
@@ -269,6 +271,56 @@ def test_partial_overlap_with_holes_is_enough():
     rotation, translation = errors(result.T_target_source)
     assert rotation < 0.2
     assert translation < 1.0
+
+
+def plates(camera, T_scene_camera):
+    """Depth image of a square plate 0.8 m away before a parallel wall at 1.2 m, both exact."""
+    o, d = T_scene_camera[:3, 3], poses.rotate_vectors(T_scene_camera, camera.rays)
+    at = o + d * ((0.8 - o[2]) / d[..., 2])[..., None]
+    turned = at[..., :2] @ np.array([[0.96, -0.28], [0.28, 0.96]])
+    on_plate = (np.abs(turned) < 0.15).all(axis=-1)
+    return camera.unproject(np.where(on_plate, (0.8 - o[2]) / d[..., 2], (1.2 - o[2]) / d[..., 2]))
+
+
+def test_edges_hold_what_parallel_planes_do_not():
+    """A plate before a parallel wall slides on its surfaces alone; the edges bring it back to 0.3 mm from 2 mm and 0.3 degrees."""
+    stereo, points = plates(STEREO, poses.invert(TRUE)), plates(TOF, np.eye(4))
+    grid = surface_grid(stereo, STEREO)
+    start = TRUE @ poses.transform(poses.rotation_exp([0, 0, 0.005]), [0.0015, -0.0015, 0])
+    loose = register_projective(points.reshape(-1, 3), grid, start, 0.002, ())
+    held = register_projective(points, grid, start, 0.002, (), stereo_edges(stereo, STEREO, grid))
+    assert errors(held.T_target_source)[1] < 0.3 < errors(loose.T_target_source)[1]
+    assert errors(held.T_target_source)[0] < 0.1
+    assert held.condition < loose.condition
+
+
+def test_edges_between_the_rays_cost_nothing():
+    """At the truth every matched edge of exact data lies between its rays or within a stereo pixel of them."""
+    stereo, points = plates(STEREO, poses.invert(TRUE)), plates(TOF, np.eye(4))
+    found = stereo_edges(stereo, STEREO, surface_grid(stereo, STEREO))
+    match, weights = match_edges(tof_edges(points), found, TRUE, 0.001)
+    assert len(match.rays) > 150
+    assert np.abs(match.distance).max() < 0.001
+    assert (match.distance == 0).mean() > 0.8
+    np.testing.assert_array_equal(weights == 0, match.distance == 0)
+
+
+def test_edges_need_an_image():
+    """Points that have lost their pixels have no neighbours: edges with them are a data error."""
+    edges = stereo_edges(stereo_points(), STEREO, GRID)
+    with pytest.raises(DataError, match="image"):
+        register_projective(tof_points(), GRID, TRUE, 0.002, edges=edges)
+
+
+def test_backend_takes_the_image_of_an_organised_cloud():
+    """The full grid in place of the cloud, and points repeated to weigh more, answer the same registration."""
+    points, cloud = tof_points(np.random.default_rng(11), 0.002), GRID.cloud()
+    z = stereo_points(3e-4)[..., 2]
+    organised = OrganisedCloud(cloud.points[::8], cloud.normals[::8], z, STEREO)
+    result = register("projective", points, organised, guess(11, 1.0, 0.01))
+    rotation, translation = errors(result.T_target_source)
+    assert rotation < 0.1
+    assert translation < 0.6
 
 
 def test_few_points_are_refused_as_empty():

@@ -93,11 +93,16 @@ def _dot(a: Float64, b: Float64) -> Float64:
     return out
 
 
+def is_rim(cloud: Cloud) -> NDArray[np.bool_]:
+    """Which points of a cloud are on rims: their normals lie across the view."""
+    view = (cloud.points * cloud.normals).sum(axis=1)
+    out: NDArray[np.bool_] = np.abs(view) < EDGE_ON * np.sqrt(np.square(cloud.points).sum(axis=1))
+    return out
+
+
 def cloud_map(cloud: Cloud) -> CloudMap:
     """Draw a cloud as its own camera sees it; points behind that camera are left out."""
-    ahead = cloud.points[:, 2] > 0
-    view = (cloud.points * cloud.normals).sum(axis=1)
-    rim = np.abs(view) < EDGE_ON * np.sqrt(np.square(cloud.points).sum(axis=1))
+    ahead, rim = cloud.points[:, 2] > 0, is_rim(cloud)
     parts = (np.flatnonzero(ahead & ~rim), np.flatnonzero(ahead & rim))
     if not ahead.any():
         return CloudMap(cloud, ())

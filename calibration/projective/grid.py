@@ -75,16 +75,25 @@ class SurfaceGrid:
             Found where a point projects onto a smooth block.
         """
         camera = self.camera
+        u, v, inside = self._pixels(points)
+        column, row = np.rint(u), np.rint(v)
+        cell = row.astype(np.intp) * camera.width + column.astype(np.intp)
+        normals, offsets = _tangent(self.coefficients[cell].T, u, v, u - column, v - row, camera)
+        return Planes(normals, offsets, inside & self.smooth[cell])
+
+    def in_view(self, points: Float64) -> NDArray[np.bool_]:
+        """Which of the points (3, N), stereo frame, lie in the camera's field of view, measured there or not."""
+        return self._pixels(points)[2]
+
+    def _pixels(self, points: Float64) -> tuple[Float64, Float64, NDArray[np.bool_]]:
+        """Pixels (N,) of points (3, N), zero outside the image, and which lie inside."""
+        camera = self.camera
         with np.errstate(divide="ignore", invalid="ignore"):
             u = points[0] / points[2] * camera.fx + camera.cx
             v = points[1] / points[2] * camera.fy + camera.cy
         inside = (points[2] > 0) & (np.abs(u - camera.width / 2 + 0.5) < camera.width / 2)
         inside &= np.abs(v - camera.height / 2 + 0.5) < camera.height / 2
-        u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
-        column, row = np.rint(u), np.rint(v)
-        cell = row.astype(np.intp) * camera.width + column.astype(np.intp)
-        normals, offsets = _tangent(self.coefficients[cell].T, u, v, u - column, v - row, camera)
-        return Planes(normals, offsets, inside & self.smooth[cell])
+        return np.where(inside, u, 0.0), np.where(inside, v, 0.0), inside
 
     def cloud(self) -> Cloud:
         """Block centres with normals that face the camera, stereo frame; what nearest-neighbour backends and gates take."""
@@ -122,7 +131,12 @@ def surface_grid(points: NDArray[np.floating], camera: Camera) -> SurfaceGrid:
     """
     if points.shape != (*camera.shape, 3):
         raise DataError(f"stereo points: expected ({camera.height}, {camera.width}, 3), got {points.shape}")
-    q, measured = _block_means(points[..., 2])
+    return grid_of_depth(points[..., 2], camera)
+
+
+def grid_of_depth(depth: NDArray[np.floating], camera: Camera) -> SurfaceGrid:
+    """Fit the surface of a depth map (H, W), metres, NaN where nothing was measured; see :func:`surface_grid`."""
+    q, measured = _block_means(depth)
     height, width = q.shape
     c = np.zeros((6, height, width))
     c[:, 1:-1, 1:-1] = _quadratic(q)

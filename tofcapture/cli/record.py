@@ -65,8 +65,32 @@ def _run(args: argparse.Namespace) -> Outcome:
             return _planned(scene, plan_scene(station, scene, views))
         _check_motion(station, allowed=args.allow_motion)
         with progress_line(f"record {scene}") as progress:
-            result = record(station, scene, args.out, views=views, frames=args.frames, progress=progress)
+            show = progress
+            if args.calibration:
+                show = _metered(progress, station, args.out, plan_scene(station, scene, views))
+            result = record(station, scene, args.out, views=views, frames=args.frames, progress=show)
     return _recorded(args.out, result)
+
+
+def _metered(
+    progress: Callable[[int, int], None], station: Station, recording: Path, plan: Plan
+) -> Callable[[int, int], None]:
+    """Print what the board views cover after each one."""
+    from tofcapture.devices.sim.scenes import CALIBRATION
+    from tofcapture.record.board_meter import meter, taken
+    from tofcapture.record.clearance import stage_of
+
+    stage, rig, said = stage_of(station.config), station.rig, [-1]
+
+    def show(done: int, total: int) -> None:
+        progress(done, total)
+        flanges = taken(plan, recording, CALIBRATION)
+        if len(flanges) not in {said[0], 0}:
+            said[0] = len(flanges)
+            poses = [T @ rig.T_flange_tof for T in flanges]
+            print(meter(poses, stage.board, stage.board_normal, rig.tof), file=sys.stderr, flush=True)
+
+    return show
 
 
 def _check_motion(station: Station, *, allowed: bool) -> None:
