@@ -6,24 +6,30 @@ journal agree with them.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import sqlite3
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tofcapture.errors import BusyError, ConfigError, DataError
+from tofcapture.record.watch import is_full
+
+if TYPE_CHECKING:
+    from tofcapture.devices import Arm
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS views (
     scene TEXT NOT NULL, "index" INTEGER NOT NULL, pose TEXT NOT NULL,
     state TEXT NOT NULL CHECK (state IN ('planned', 'sealed', 'failed')),
     sha256 TEXT, attempts INTEGER NOT NULL DEFAULT 0, reason TEXT NOT NULL DEFAULT '',
-    planned_utc TEXT NOT NULL, changed_utc TEXT NOT NULL,
+    planned_utc TEXT NOT NULL, changed_utc TEXT NOT NULL, step TEXT NOT NULL DEFAULT '',
     PRIMARY KEY (scene, "index")
 );
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
@@ -32,17 +38,20 @@ CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 
 _PLAN = """
 INSERT INTO views (scene, "index", pose, state, planned_utc, changed_utc) VALUES (?, ?, ?, 'planned', ?, ?)
-ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'planned', changed_utc = excluded.changed_utc WHERE state != 'sealed'
+ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'planned', step = '', changed_utc = excluded.changed_utc WHERE state != 'sealed'
 """
 _ADOPT = """
 INSERT INTO views (scene, "index", pose, state, sha256, planned_utc, changed_utc) VALUES (?, ?, ?, 'sealed', ?, ?, ?)
-ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'sealed', sha256 = excluded.sha256, reason = ''
+ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'sealed', sha256 = excluded.sha256, reason = '', step = ''
 """
 
 
 @dataclass(frozen=True)
 class Row:
-    """What the journal says of one view; ``pose`` is the planned view's digest."""
+    """What the journal says of one view.
+
+    ``pose`` is the planned view's digest, ``step`` what was begun last for a view that is not sealed (``record.watch.STEPS``).
+    """
 
     scene: str
     index: int
@@ -51,6 +60,7 @@ class Row:
     sha256: str | None
     attempts: int
     reason: str
+    step: str = ""
 
 
 def utc_now() -> str:
@@ -90,6 +100,37 @@ def hold(recording: Path) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def hold_arm(arm: Arm) -> Iterator[None]:
+    """Hold a real arm for this process: two recorders of two recordings must not move it in turn.
+
+    Raises
+    ------
+    BusyError
+        When another process of this machine moves it.
+    """
+    import fcntl
+
+    if getattr(arm, "simulated", False):
+        yield
+        return
+    info = arm.describe()
+    name = hashlib.sha256(f"{info.model}|{info.serial}".encode()).hexdigest()[:16]
+    path = Path(tempfile.gettempdir()) / f"tofcapture-arm-{name}.lock"
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+    except PermissionError:  # another user's file in a sticky folder can be locked, but not created
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    with os.fdopen(handle):
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as err:
+            raise BusyError(
+                f"the arm {info.model} {info.serial} is moved by another process", hint="tofcapture status"
+            ) from err
+        yield
+
+
 class Journal:
     """Open journal of a recording; one transaction per call, on disk when the call returns.
 
@@ -106,10 +147,18 @@ class Journal:
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=FULL")
             self._db.executescript(_SCHEMA)
+            self._grow()
         except sqlite3.DatabaseError as err:
+            if is_full(err):
+                raise
             raise DataError(
                 f"{path}: not a journal: {err}", hint="move it away: it is rebuilt from the view files"
             ) from err
+
+    def _grow(self) -> None:
+        """Add what journals of earlier versions lack."""
+        if "step" not in {row[1] for row in self._db.execute("PRAGMA table_info(views)")}:
+            self._db.execute("ALTER TABLE views ADD COLUMN step TEXT NOT NULL DEFAULT ''")
 
     def close(self) -> None:
         """Close the database."""
@@ -119,7 +168,7 @@ class Journal:
         """All rows, or those of one scene, by scene and number."""
         where, values = ("WHERE scene = ?", (scene,)) if scene else ("", ())
         found = self._db.execute(
-            f'SELECT scene, "index", pose, state, sha256, attempts, reason FROM views {where} ORDER BY scene, "index"',  # noqa: S608
+            f'SELECT scene, "index", pose, state, sha256, attempts, reason, step FROM views {where} ORDER BY scene, "index"',  # noqa: S608
             values,
         )
         return [Row(*row) for row in found]
@@ -169,21 +218,25 @@ class Journal:
         self._db.execute("COMMIT")
         return sealed.keys() & poses.keys()
 
+    def step(self, scene: str, index: int, step: str) -> None:
+        """Note what is about to be done for a view."""
+        self._set(scene, index, "step = ?", step)
+
     def attempt(self, scene: str, index: int) -> None:
         """Count one more attempt, before anything moves."""
         self._set(scene, index, "attempts = attempts + 1")
 
     def seal(self, scene: str, index: int, sha256: str) -> None:
         """Note that a view is on disk under its name."""
-        self._set(scene, index, "state = 'sealed', reason = '', sha256 = ?", sha256)
+        self._set(scene, index, "state = 'sealed', reason = '', step = '', sha256 = ?", sha256)
 
     def fail(self, scene: str, index: int, reason: str) -> None:
         """Note that a view was given up."""
-        self._set(scene, index, "state = 'failed', reason = ?", reason)
+        self._set(scene, index, "state = 'failed', step = '', reason = ?", reason)
 
     def forget(self, scene: str, index: int, reason: str) -> None:
         """Plan a view again whose file is gone."""
-        self._set(scene, index, "state = 'planned', sha256 = NULL, reason = ?", reason)
+        self._set(scene, index, "state = 'planned', sha256 = NULL, step = '', reason = ?", reason)
 
     def adopt(self, scene: str, index: int, pose: str, sha256: str) -> None:
         """Note a verified file that the journal did not know to be sealed."""

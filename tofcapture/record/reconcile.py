@@ -6,12 +6,13 @@ a damaged file is set aside under another name so that its view can be taken aga
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 from tofcapture.errors import DataError
 from tofcapture.files.seal import sealed_digest
 from tofcapture.files.view import read_view, view_path
-from tofcapture.record.journal import Journal
+from tofcapture.record.journal import Journal, Row
 
 
 def reconcile(journal: Journal, recording: Path, scene: str) -> list[str]:
@@ -30,7 +31,26 @@ def reconcile(journal: Journal, recording: Path, scene: str) -> list[str]:
     """
     folder = view_path(recording, scene, 0).parent
     known = {row.index for row in journal.rows(scene) if row.state == "sealed"}
-    return [*_sweep(folder), *_adopt(journal, folder, known), *_miss(journal, recording, scene, known)]
+    begun = [row for row in journal.rows(scene) if row.step]
+    return [
+        *_sweep(folder),
+        *_adopt(journal, folder, known),
+        *_miss(journal, recording, scene, known),
+        *_roll_back(journal, begun),
+    ]
+
+
+def _roll_back(journal: Journal, begun: list[Row]) -> list[str]:
+    """Plan views again in whose midst the last run ended, unless their files turned out to be whole."""
+    sealed = {(row.scene, row.index) for row in journal.rows() if row.state == "sealed"}
+    done = []
+    for row in begun:
+        if (row.scene, row.index) not in sealed:
+            journal.step(row.scene, row.index, "")
+            done.append(
+                f"view {row.index} of {row.scene!r}: the last run ended at {row.step!r}, it is taken again"
+            )
+    return done
 
 
 def _sweep(folder: Path) -> list[str]:
@@ -66,6 +86,10 @@ def _adopt_one(journal: Journal, path: Path, scene: str, index: int) -> str:
 def _set_aside(path: Path) -> Path:
     """Rename a file; nothing is ever deleted that might be data."""
     aside = path.with_name(f"{path.name}.damaged")
+    for number in itertools.count(2):
+        if not aside.exists():
+            break
+        aside = path.with_name(f"{path.name}.damaged-{number}")
     path.rename(aside)
     return aside
 

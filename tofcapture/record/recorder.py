@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import shutil
+import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
@@ -20,10 +21,11 @@ from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, View
 from tofcapture.poses import Float64, invert, rotation_angle
 from tofcapture.record.clearance import route, stage_of
-from tofcapture.record.journal import Journal, hold, utc_now
+from tofcapture.record.journal import Journal, hold, hold_arm, utc_now
 from tofcapture.record.plan import Plan, PlannedView
 from tofcapture.record.reconcile import reconcile
 from tofcapture.record.scene_plan import plan_scene
+from tofcapture.record.watch import DiskFull, Watch, is_full
 
 _VIEW_BYTES = 40e6  # a view of a full-size rig with truth, and room to spare
 _RESERVE_BYTES = 0.5e9
@@ -75,6 +77,7 @@ def record(
     views: int = 25,
     frames: int = 10,
     progress: Progress = _silent,
+    watch: Watch | None = None,
 ) -> RecordResult:
     """Take every missing view of one scene.
 
@@ -93,41 +96,45 @@ def record(
         Views of the scene, ToF frames of each burst.
     progress
         Called with (views there, views planned) before the first and after each view.
+    watch
+        Looks on; may make the recorder wait between views, or end it.
 
     Raises
     ------
     ConfigError
-        The recording was begun with other cameras, frames or poses; or the disk is too small.
+        The recording was begun with other cameras, frames or poses.
+    DiskFull
+        The disk is too small, or full.
     BusyError
-        Another recorder is at work on this recording.
+        Another recorder is at work on this recording, or moves this arm.
     DeviceError
         Two views in a row failed three times each.
+    Stopped
+        The watch ended the run.
     """
     if frames < 1:
         raise ConfigError(f"frames: expected at least 1, got {frames}")
+    watch = watch or Watch()
     plan = plan_scene(station, scene, views)
-    _begin(recording, station)
-    with hold(recording), closing(Journal(recording)) as journal:
-        journal.agree({"station": station.describe(), "frames": frames, "sim": station.config.get("sim", {})})
-        repaired = reconcile(journal, recording, scene)
-        kept = journal.expect(scene, {view.index: view.digest for view in plan.views})
-        missing = [view for view in plan.views if view.index not in kept]
-        _check_space(recording, len(missing))
-        if missing:
-            station.operator.place(scene)
-        reasons: dict[int, str] = {}
-        for turn, planned in enumerate(missing):
-            progress(len(kept) + turn - len(reasons), len(plan.views))
-            try:
-                view = _take(station, scene, planned, frames, _provenance(station, plan, planned), journal)
-                digest = write_view(view_path(recording, scene, planned.index), view)
-                journal.seal(scene, planned.index, digest)
-            except DeviceError as err:
-                journal.fail(scene, planned.index, err.message)
-                reasons[planned.index] = err.message
-                if _hopeless(missing[: turn + 1], reasons):
-                    raise
-        progress(len(plan.views) - len(reasons), len(plan.views))
+    try:
+        _begin(recording, station)
+        with hold(recording), hold_arm(station.arm), closing(Journal(recording)) as journal:
+            journal.agree(
+                {"station": station.describe(), "frames": frames, "sim": station.config.get("sim", {})}
+            )
+            repaired = reconcile(journal, recording, scene)
+            kept = journal.expect(scene, {view.index: view.digest for view in plan.views})
+            watch.planned(plan, kept, repaired)
+            missing = [view for view in plan.views if view.index not in kept]
+            taking = _Taking(station, scene, recording, frames, plan, journal, watch)
+            reasons = _take_all(taking, missing, len(kept), progress)
+    except (OSError, RuntimeError, sqlite3.OperationalError) as err:
+        if not is_full(err):
+            raise
+        raise DiskFull(
+            f"{recording}: the disk takes no more: {str(err).partition('(')[0].strip()}",
+            hint="free some space, then run the same again",
+        ) from err
     return RecordResult(
         scene=scene,
         recorded=tuple(sorted({view.index for view in missing} - reasons.keys())),
@@ -137,6 +144,49 @@ def record(
         repaired=tuple(repaired),
         plan=plan,
     )
+
+
+@dataclass(frozen=True)
+class _Taking:
+    """What stays the same from view to view."""
+
+    station: Station
+    scene: str
+    recording: Path
+    frames: int
+    plan: Plan
+    journal: Journal
+    watch: Watch
+
+    def begin(self, index: int, step: str) -> None:
+        """Journal a step of a view, before anything is done."""
+        self.journal.step(self.scene, index, step)
+        self.watch.step(index, step)
+
+
+def _take_all(taking: _Taking, missing: list[PlannedView], kept: int, progress: Progress) -> dict[int, str]:
+    """Take views in turn; return the reason of each that was given up, by number."""
+    _check_space(taking.recording, len(missing))
+    if missing:
+        taking.station.operator.place(taking.scene)
+    total = len(taking.plan.views)
+    reasons: dict[int, str] = {}
+    for turn, planned in enumerate(missing):
+        progress(kept + turn - len(reasons), total)
+        taking.watch.before_view(planned.index)
+        _check_space(taking.recording, 1)
+        try:
+            _take(taking, planned)
+        except DeviceError as err:
+            # An arm that was told to stop refuses to move: that is no failure of the view.
+            taking.watch.step(planned.index, "failed")
+            taking.journal.fail(taking.scene, planned.index, err.message)
+            taking.watch.failed(planned.index, err.message)
+            reasons[planned.index] = err.message
+            if _hopeless(missing[: turn + 1], reasons):
+                raise
+    progress(total - len(reasons), total)
+    return reasons
 
 
 def _hopeless(tried: list[PlannedView], reasons: dict[int, str]) -> bool:
@@ -161,47 +211,66 @@ def _check_space(recording: Path, missing: int) -> None:
     free = shutil.disk_usage(recording).free
     needed = missing * _VIEW_BYTES + _RESERVE_BYTES
     if missing and free < needed:
-        raise ConfigError(
+        raise DiskFull(
             f"{recording}: expected {needed / 1e9:.1f} GB of free disk, got {free / 1e9:.1f} GB",
             hint="free some space, or ask for fewer views",
         )
 
 
-def _take(
-    station: Station,
-    scene: str,
-    planned: PlannedView,
-    frames: int,
-    provenance: dict[str, Any],
-    journal: Journal,
-) -> View:
-    """Take one view, three times at most; a refused motion is refused for good."""
+def _take(taking: _Taking, planned: PlannedView) -> None:
+    """Take and seal one view, three attempts at most; a refused motion is refused for good."""
+    provenance = _provenance(taking.station, taking.plan, planned)
     for attempt in range(1, _ATTEMPTS + 1):
-        journal.attempt(scene, planned.index)
+        taking.journal.attempt(taking.scene, planned.index)
         try:
-            return capture(station, scene, planned, frames, provenance)
+            view = capture(
+                taking.station,
+                taking.scene,
+                planned,
+                taking.frames,
+                provenance,
+                lambda step: taking.begin(planned.index, step),
+            )
         except MotionRefused:
             raise
         except DeviceError:
             if attempt == _ATTEMPTS:
                 raise
-    raise AssertionError
+        else:
+            break
+    taking.begin(planned.index, "sealing")
+    digest = write_view(view_path(taking.recording, taking.scene, planned.index), view)
+    taking.journal.seal(taking.scene, planned.index, digest)
+    taking.watch.sealed(view, digest)
+
+
+def _no_step(step: str) -> None:
+    del step
 
 
 def capture(
-    station: Station, scene: str, planned: PlannedView, frames: int, provenance: dict[str, Any]
+    station: Station,
+    scene: str,
+    planned: PlannedView,
+    frames: int,
+    provenance: dict[str, Any],
+    begin: Callable[[str], None] = _no_step,
 ) -> View:
     """Go there and take one view: arm, ToF burst, stereo frame, arm again.
 
-    ToF comes first and alone: the stereo camera's projector would shine into its pixels.
+    ToF comes first and alone: the stereo camera's projector would shine into its pixels. ``begin`` is called with the name
+    of each step ahead of it.
 
     Raises
     ------
     DeviceError
         A device fails, or the rig moved between the exposures.
     """
+    begin("moving")
     before = _go(station, planned)
+    begin("tof")
     tof = station.tof.capture(frames)
+    begin("stereo")
     stereo = station.stereo.capture()
     after = station.arm.state()
     _check_still(before, after)

@@ -1,0 +1,311 @@
+"""A daemon and recorder over a station made of arrays: no simulator, no planning of thousands, so that a view takes no time.
+
+    python benchmarks/daemon_station.py daemon ROOT STATE [--http 127.0.0.1:0] [--station arrays | FILE.toml]
+
+The worker's environment: ``BENCH_DELAY`` seconds per device step, ``BENCH_LOG`` a file that gets a line per stop of the arm,
+``BENCH_FULL`` a file: while it exists, the disk is full from the write on whose number stands in it;
+``BENCH_ASKS`` set: a person must confirm the scene; ``BENCH_HOST`` set: the arm has a driver host; ``BENCH_LARGE`` set: images of full size.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import itertools
+import os
+import sqlite3
+import sys
+import time
+from collections.abc import Callable
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Self
+
+SMALL_STATION = """
+[arm]
+driver = "sim"
+[tof]
+driver = "sim"
+[stereo]
+driver = "sim"
+[operator]
+driver = "sim"
+[sim]
+seed = 0
+[sim.tof]
+width = 24
+height = 18
+fx = 19.06
+fy = 20.07
+cx = 11.5
+cy = 9.7
+[sim.stereo]
+width = 64
+height = 48
+fx = 57.0
+fy = 57.0
+cx = 31.5
+cy = 23.5
+[sim.render]
+multipath = false
+subpixels = 1
+[plan]
+table = -0.50
+target = [0.70, 0.0, -0.44]
+board = [0.70, 0.0, -0.22]
+board_normal = [-0.258819, 0.0, 0.965926]
+"""
+
+
+class _Arrays:
+    """Arm, cameras and operator in one: what a camera sees hangs on the pose alone."""
+
+    simulated = True
+
+    def __init__(self) -> None:
+        import numpy as np
+
+        from tofcapture.camera import Camera
+        from tofcapture.devices.kinematics import HOME
+
+        self.np, self.joints, self.role = np, HOME.copy(), ""
+        a, b = (10, 40) if "BENCH_LARGE" in os.environ else (1, 1)
+        self.tof = Camera(24, 18, 20.0, 20.0, 11.5, 8.5).scaled(a)
+        self.stereo = Camera(32, 24, 30.0, 30.0, 15.5, 11.5).scaled(b)
+
+    def step(self) -> None:
+        time.sleep(float(os.environ.get("BENCH_DELAY", "0")))
+
+    def rng(self, name: str) -> Any:
+        return self.np.random.default_rng(
+            [len(name), *self.np.abs(self.np.round(self.joints * 1e6)).astype(int)]
+        )
+
+
+class _Role:
+    simulated = True
+
+    def __init__(self, bench: _Arrays, role: str) -> None:
+        self.bench, self.role = bench, role
+
+    def describe(self) -> Any:
+        from tofcapture.frames import ArmInfo, StereoInfo, TofInfo
+
+        if self.role == "arm":
+            return ArmInfo("ur10e", "arrays")
+        if self.role == "tof":
+            return TofInfo("arrays", "A", self.bench.tof, self.bench.np.zeros(3))
+        return StereoInfo("arrays", "A", self.bench.stereo)
+
+    def state(self) -> Any:
+        from tofcapture.devices.kinematics import MODELS, forward
+        from tofcapture.frames import ArmState
+
+        return ArmState(self.bench.joints.copy(), forward(MODELS["ur10e"], self.bench.joints), 1)
+
+    def move_to(self, joints: Any) -> Any:
+        self.bench.step()
+        self.bench.joints = self.bench.np.array(joints)
+        return self.state()
+
+    def stop(self) -> None:
+        if log := os.environ.get("BENCH_LOG"):
+            with Path(log).open("a", encoding="ascii") as file:
+                file.write("stop\n")
+
+    def capture(self, frames: int | None = None) -> Any:
+        from tofcapture.frames import StereoFrame, TofBurst
+
+        np, rng = self.bench.np, self.bench.rng(self.role)
+        self.bench.step()
+        if self.role == "tof":
+            raw = rng.integers(0, 4096, (frames, 8, *self.bench.tof.shape)).astype(np.uint16)
+            return TofBurst(raw, np.arange(frames), np.full(frames, 40.0), self.describe())
+        points = rng.uniform(0.4, 1.0, (*self.bench.stereo.shape, 3)).astype(np.float32)
+        return StereoFrame(points, 2, self.describe())
+
+    def place(self, scene: str) -> None:
+        del scene
+
+    def truth(self) -> None:
+        return None
+
+
+@contextmanager
+def _open_arrays(path: Path | None = None, seed: int | None = None, allow_motion: bool = False) -> Any:
+    import numpy as np
+
+    from tofcapture.devices.station import Station, read_station
+    from tofcapture.poses import transform
+    from tofcapture.rig import Rig
+
+    del path, allow_motion
+    config, bench = read_station(None, seed), _Arrays()
+    if "BENCH_ASKS" in os.environ:
+        config["operator"] = {"driver": "console"}
+    places = transform(np.eye(3), [-0.05, 0.08, 0.0]), transform(np.eye(3), [0.0, -0.035, 0.08])
+    station = Station(
+        *(_Role(bench, role) for role in ("arm", "tof", "stereo", "operator")),
+        Rig(bench.tof, bench.stereo, *places),
+        config,
+    )
+    try:
+        yield station
+    except BaseException:
+        station.arm.stop()
+        raise
+
+
+class HostArm:
+    """An arm in a process of its own, that only takes its time."""
+
+    simulated = True
+
+    def __init__(self, table: object, context: object) -> None:
+        del table, context
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def describe(self) -> Any:
+        """Say what it is."""
+        from tofcapture.frames import ArmInfo
+
+        return ArmInfo("ur10e", "hosted")
+
+    def move_to(self, joints: Any) -> Any:
+        """Take time."""
+        time.sleep(float(os.environ.get("BENCH_DELAY", "0")))
+        return joints
+
+    def stop(self) -> None:
+        """Nothing moves."""
+
+
+class _Followed:
+    """The station's arm, which moves when the hosted one has."""
+
+    simulated = True
+
+    def __init__(self, hosted: Any, arm: Any) -> None:
+        self._hosted, self._arm = hosted, arm
+        self.describe, self.state = arm.describe, arm.state
+
+    def move_to(self, joints: Any) -> Any:
+        self._hosted.move_to(joints)
+        return self._arm.move_to(joints)
+
+    def stop(self) -> None:
+        self._hosted.stop()
+        self._arm.stop()
+
+
+def _with_host(open_real: Callable[..., Any]) -> Callable[..., Any]:
+    """Put the arm of a station into a driver host."""
+    from dataclasses import replace
+
+    from tofcapture.devices.host import HostedArm
+    from tofcapture.devices.registry import StationContext
+
+    @contextmanager
+    def opened(path: Path | None = None, seed: int | None = None, *, allow_motion: bool = False) -> Any:
+        with open_real(path, seed, allow_motion=allow_motion) as station:
+            context = StationContext(config=station.config, folder=Path())
+            with HostedArm("arm", "daemon_station:HostArm", {}, context, {}) as hosted:
+                yield replace(station, arm=_Followed(hosted, station.arm))
+
+    return opened
+
+
+def _fill_disk(flag: Path) -> None:
+    """Make every kind of write fail, from the one on that the flag file names, for as long as it exists."""
+    import h5py
+
+    from tofcapture.files import view
+    from tofcapture.record.journal import Journal
+
+    count = itertools.count(1)
+
+    def full() -> bool:
+        number = next(count)
+        try:
+            return number >= int(flag.read_text(encoding="ascii") or 1)
+        except (OSError, ValueError):
+            return False
+
+    def refuse(real: Callable[..., Any]) -> Callable[..., Any]:
+        def write(*args: Any, **more: Any) -> Any:
+            if full():
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return real(*args, **more)
+
+        return write
+
+    def refuse_row(real: Callable[..., Any]) -> Callable[..., Any]:
+        def write(*args: Any, **more: Any) -> Any:
+            if full():
+                raise sqlite3.OperationalError("database or disk is full")
+            return real(*args, **more)
+
+        return write
+
+    view.create, view.write_attrs = refuse(view.create), refuse(view.write_attrs)
+    os.fsync, Path.write_text = refuse(os.fsync), refuse(Path.write_text)
+    h5py.File.close = refuse(h5py.File.close)
+    Journal._set = refuse_row(Journal._set)  # noqa: SLF001
+
+
+def _few_candidates() -> None:
+    from tofcapture.record import scene_plan
+    from tofcapture.record.plan import object_sampling
+
+    sampling = object_sampling()
+    few = type(sampling)(sampling.axis, directions=60, distances=(0.5, 0.8))
+    scene_plan.object_sampling = lambda: few
+
+
+def worker(station: str) -> None:
+    """Run the recorder's process on this station."""
+    from tofcapture.devices import station as stations
+    from tofcapture.record.daemon import worker as real
+
+    if station == "arrays":
+        stations.open_station = _open_arrays
+    if "BENCH_HOST" in os.environ:
+        known = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(Path(__file__).parent), *known]))
+        stations.open_station = _with_host(stations.open_station)
+    _few_candidates()
+    if flag := os.environ.get("BENCH_FULL"):
+        _fill_disk(Path(flag))
+    real.main()
+
+
+def daemon(args: argparse.Namespace) -> None:
+    """Run a daemon whose recorder is :func:`worker`."""
+    from tofcapture.record.daemon.server import serve, tcp_address
+    from tofcapture.record.daemon.settings import Settings
+    from tofcapture.record.daemon.state import open_folder
+
+    args.root.mkdir(parents=True, exist_ok=True)
+    toml = None if args.station == "arrays" else Path(args.station)
+    command = (sys.executable, __file__, "worker", "--station", args.station)
+    settings = Settings(args.root.resolve(), open_folder(args.state), toml, worker=command)
+    serve(settings, tcp_address(args.http) if args.http else None, lambda url: print(url, flush=True))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=["daemon", "worker"])
+    parser.add_argument("root", type=Path, nargs="?")
+    parser.add_argument("state", type=Path, nargs="?")
+    parser.add_argument("--http")
+    parser.add_argument("--station", default="arrays")
+    given = parser.parse_args()
+    if given.what == "worker":
+        worker(given.station)
+    else:
+        daemon(given)

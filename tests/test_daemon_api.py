@@ -1,0 +1,379 @@
+"""The daemon's API: who may ask, what is refused and how, and a recording from the queue to the sealed view."""
+
+import asyncio
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tofcapture.errors import BusyError, DataError, DeviceError, UsageError
+from tofcapture.files.view import read_view
+from tofcapture.record.daemon.client import ask, hand_over
+from tofcapture.record.daemon.schema import document
+
+pytest.importorskip("aiohttp")
+
+ROOT = Path(__file__).parents[1]
+STATION = ROOT / "benchmarks" / "daemon_station.py"
+VERB = {"X-Tofcapture": "1", "Content-Type": "application/json"}
+
+
+class Daemon:
+    """A daemon in a process of its own, over the station of arrays."""
+
+    def __init__(self, folder, process):
+        self.root, self.state, self.process = folder / "root", folder / "st", process
+        self.url = process.stdout.readline().strip()
+        self.port = int(self.url.partition("/#")[0].rpartition(":")[2])
+        self.token = self.url.partition("#token=")[2]
+
+    def ask(self, method, path, body=None):
+        return ask(method, path, body, self.state)
+
+    def wait(self, wanted, seconds=20.0):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            state = self.ask("GET", "/v1/state")
+            if wanted(state):
+                return state
+            time.sleep(0.05)
+        raise AssertionError(state)
+
+    def tcp(self, method, path, headers, body=None, token=True):
+        """Status and JSON over TCP."""
+        link = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        try:
+            shown = {"Authorization": f"Bearer {self.token}"} if token else {}
+            link.request(method, path, body, {**shown, **headers})
+            answer = link.getresponse()
+            data = answer.read()
+            return (
+                answer.status,
+                json.loads(data) if data.startswith(b"{") else data,
+                dict(answer.getheaders()),
+            )
+        finally:
+            link.close()
+
+
+@contextmanager
+def running(folder, *options, port=0, **env):
+    """Start a daemon; end it by its id."""
+    command = [
+        sys.executable,
+        STATION,
+        "daemon",
+        folder / "root",
+        folder / "st",
+        "--http",
+        f"127.0.0.1:{port}",
+    ]
+    process = subprocess.Popen(
+        [*command, *options],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **{k: str(v) for k, v in env.items()}},
+    )
+    try:
+        yield Daemon(folder, process)
+    finally:
+        process.terminate()
+        process.wait(10)
+        process.stdout.close()
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory):
+    """One resting daemon for all that is refused."""
+    with running(tmp_path_factory.mktemp("d")) as daemon:
+        daemon.ask("POST", "/v1/pause")
+        yield daemon
+
+
+def _over(state):
+    return bool(state["job"]) and state["job"]["state"] in {"done", "failed", "stopped"}
+
+
+def test_records_a_scene_with_pause_and_previews(tmp_path):
+    """A queued scene is recorded; pause rests between views, resume goes on; views, pictures and events say so."""
+    with running(tmp_path, BENCH_DELAY=0.05) as daemon:
+        job = daemon.ask("POST", "/v1/jobs", {"scene": "mug", "recording": "r", "views": 6, "frames": 2})
+        daemon.wait(lambda s: s["progress"]["sealed"] >= 1)
+        daemon.ask("POST", "/v1/pause")
+        resting = daemon.wait(lambda s: s["phase"] == "paused")
+        time.sleep(0.4)
+        assert daemon.ask("GET", "/v1/state")["progress"] == resting["progress"]
+        assert resting["progress"]["sealed"] < 6
+        daemon.ask("POST", "/v1/resume")
+        assert daemon.wait(_over)["job"]["state"] == "done"
+        views = daemon.ask("GET", "/v1/views")["views"]
+        assert [v["state"] for v in views] == ["sealed"] * 6
+        assert {"saturated", "stereo_coverage", "motion_m", "frame_drops"} <= views[0]["quality"].keys()
+        for name in ("amplitude", "depth", "stereo"):
+            status, picture, _ = daemon.tcp("GET", f"/v1/preview/{name}", {})
+            assert (status, picture[:4]) == (200, b"\x89PNG")
+        assert daemon.ask("GET", f"/v1/jobs/{job['id']}")["state"] == "done"
+        kinds = _events(daemon, after=0, wanted=30)
+        assert {"queued", "state", "planned", "step", "sealed", "paused", "resumed"} <= set(kinds)
+        assert b"tofcapture_views_sealed_total 6" in daemon.tcp("GET", "/metrics", {})[1]
+    for view in views:
+        assert (
+            read_view(tmp_path / "root" / "r" / "views" / "mug" / f"view-{view['index']:03d}.h5").scene
+            == "mug"
+        )
+
+
+def _events(daemon, after, wanted):
+    """Kinds of the first events of a stream."""
+    with socket.create_connection(("127.0.0.1", daemon.port), timeout=10) as link:
+        head = f"GET /v1/events?after={after} HTTP/1.1\r\nHost: 127.0.0.1:{daemon.port}\r\n"
+        link.sendall(f"{head}Authorization: Bearer {daemon.token}\r\n\r\n".encode())
+        text = ""
+        while text.count("event: ") < wanted:
+            text += link.recv(65536).decode()
+    numbers = [int(line[4:]) for line in text.splitlines() if line.startswith("id: ")]
+    assert numbers == sorted(set(numbers))
+    assert min(numbers) > after
+    return [line[7:] for line in text.splitlines() if line.startswith("event: ")]
+
+
+def test_stop_keeps_what_is_sealed(tmp_path):
+    """Stop ends the job at once and stops the arm; the same scene asked again goes on, once per request id."""
+    log = tmp_path / "log"
+    with running(tmp_path, BENCH_DELAY=0.1, BENCH_LOG=log) as daemon:
+        wish = {"scene": "mug", "recording": "r", "views": 5, "frames": 2}
+        daemon.ask("POST", "/v1/jobs", {**wish, "request_id": "a"})
+        daemon.wait(lambda s: s["progress"]["sealed"] >= 1)
+        daemon.ask("POST", "/v1/stop")
+        assert daemon.wait(_over)["job"]["state"] == "stopped"
+        assert "stop" in log.read_text()
+        assert daemon.ask("POST", "/v1/jobs", {**wish, "request_id": "a"})["state"] == "stopped"
+        with pytest.raises(BusyError):
+            daemon.ask("POST", "/v1/jobs", {**wish, "views": 6, "request_id": "a"})
+        daemon.ask("POST", "/v1/jobs", {**wish, "request_id": "b"})
+        waiting = daemon.ask("POST", "/v1/jobs", {**wish, "scene": "cup"})
+        assert daemon.ask("POST", f"/v1/jobs/{waiting['id']}/cancel")["state"] == "stopped"
+        daemon.ask("POST", "/v1/resume")
+        assert daemon.wait(lambda s: s["queue"].get("done") == 1)["progress"]["sealed"] == 5
+
+
+def test_a_person_is_asked_for_the_scene(tmp_path):
+    """Where a person places scenes, the recorder waits for a confirmation."""
+    with running(tmp_path, BENCH_ASKS=1) as daemon:
+        daemon.ask("POST", "/v1/jobs", {"scene": "mug", "recording": "r", "views": 2, "frames": 2})
+        assert daemon.wait(lambda s: s["asks"])["asks"] == "mug"
+        daemon.ask("POST", "/v1/confirm")
+        assert daemon.wait(_over)["job"]["state"] == "done"
+
+
+def test_sigterm_with_open_streams(tmp_path):
+    """SIGTERM in mid-recording, streams open: the arm is stopped, within 5 s all is over, and the next daemon waits."""
+    log = tmp_path / "log"
+    with running(tmp_path, BENCH_DELAY=0.2, BENCH_LOG=log) as daemon:
+        daemon.ask("POST", "/v1/jobs", {"scene": "mug", "recording": "r", "views": 4, "frames": 2})
+        daemon.wait(lambda s: s["doing"])
+        links = [socket.create_connection(("127.0.0.1", daemon.port), timeout=10) for _ in range(20)]
+        for link in links:
+            head = f"GET /v1/events HTTP/1.1\r\nHost: 127.0.0.1:{daemon.port}\r\nAuthorization: Bearer {daemon.token}\r\n\r\n"
+            link.sendall(head.encode())
+            assert link.recv(20)
+        begin = time.monotonic()
+        daemon.process.send_signal(signal.SIGTERM)
+        assert daemon.process.wait(10) == 0
+        assert time.monotonic() - begin < 5.0
+        for link in links:
+            link.close()
+    assert "stop" in log.read_text()
+    assert not list((tmp_path / "root").rglob("*.partial"))
+    with running(tmp_path) as daemon:
+        state = daemon.ask("GET", "/v1/state")
+        assert (state["phase"], state["queue"]) == ("paused", {"queued": 1})
+        daemon.ask("POST", "/v1/resume")
+        assert daemon.wait(_over)["job"]["state"] == "done"
+
+
+def test_the_daemon_dies_and_the_arm_stops(tmp_path):
+    """Killed without warning, the daemon takes its recorder along, which stops the arm first."""
+    log = tmp_path / "log"
+    with running(tmp_path, BENCH_DELAY=0.3, BENCH_LOG=log) as daemon:
+        daemon.ask("POST", "/v1/jobs", {"scene": "mug", "recording": "r", "views": 20, "frames": 2})
+        daemon.wait(lambda s: s["doing"])
+        daemon.process.kill()
+        end = time.monotonic() + 8
+        while not log.exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        assert "stop" in log.read_text()
+
+
+def test_only_one_daemon(daemon):
+    """A second daemon in the same folder is refused."""
+    command = [sys.executable, STATION, "daemon", daemon.root, daemon.state]
+    second = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert "BusyError" in second.stderr
+    assert second.returncode != 0
+    assert daemon.ask("GET", "/v1/state")["pid"] == daemon.process.pid
+
+
+def test_files_are_private(daemon):
+    """Folder, socket and token are for the daemon's user alone."""
+    assert daemon.state.stat().st_mode & 0o777 == 0o700
+    assert (daemon.state / "daemon.sock").stat().st_mode & 0o777 == 0o600
+    assert (daemon.state / "token").stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize(
+    "path", ["/v1/state", "/v1/views", "/v1/events", "/v1/preview/depth", "/metrics", "/openapi.json", "/no"]
+)
+def test_without_token_nothing_answers(daemon, path):
+    """Every path but the page's own files wants the token; a wrong one is no better, nor one in the address."""
+    assert daemon.tcp("GET", path, {}, token=False)[0] == 401
+    assert daemon.tcp("GET", path, {"Authorization": "Bearer " + "x" * 43}, token=False)[0] == 401
+    assert daemon.tcp("GET", f"{path}?token={daemon.token}", {}, token=False)[0] == 401
+    assert daemon.tcp("POST", "/v1/stop", VERB, "{}", token=False)[0] == 401
+
+
+def test_page_is_static_and_strict(daemon):
+    """The page's files come without a token, hold no secret, and forbid everything foreign."""
+    for path in ("/", "/app.js", "/picture.js", "/style.css"):
+        status, body, headers = daemon.tcp("GET", path, {}, token=False)
+        assert status == 200
+        assert daemon.token.encode() not in body
+        assert "default-src 'none'" in headers["Content-Security-Policy"]
+        assert headers["X-Content-Type-Options"] == "nosniff"
+        assert b"http://" not in body.replace(b"http://www.w3.org/2000/svg", b"")
+        assert b"https://" not in body
+
+
+REFUSED = [
+    ("foreign Host", "GET", "/v1/state", {"Host": "evil.example"}, None, 403),
+    ("rebound Host", "POST", "/v1/stop", {**VERB, "Host": "evil.example:80"}, "{}", 403),
+    ("foreign Origin", "GET", "/v1/state", {"Origin": "http://evil.example"}, None, 403),
+    ("null Origin", "POST", "/v1/stop", {**VERB, "Origin": "null"}, "{}", 403),
+    ("cross-site", "GET", "/v1/state", {"Sec-Fetch-Site": "cross-site"}, None, 403),
+    (
+        "text/plain",
+        "POST",
+        "/v1/jobs",
+        {**VERB, "Content-Type": "text/plain"},
+        '{"scene": "a", "recording": "b"}',
+        415,
+    ),
+    ("a form", "POST", "/v1/stop", {**VERB, "Content-Type": "application/x-www-form-urlencoded"}, "a=b", 415),
+    ("no header", "POST", "/v1/stop", {"Content-Type": "application/json"}, "{}", 403),
+    ("malformed", "POST", "/v1/jobs", VERB, '{"scene": ', 400),
+    ("not UTF-8", "POST", "/v1/jobs", VERB, b'{"scene": "\xff"}', 400),
+    ("NaN", "POST", "/v1/jobs", VERB, '{"scene": "a", "recording": "b", "views": NaN}', 400),
+    ("too deep", "POST", "/v1/jobs", VERB, "[" * 30000, 400),
+    ("a list", "POST", "/v1/jobs", VERB, "[]", 422),
+    (
+        "unknown field",
+        "POST",
+        "/v1/jobs",
+        VERB,
+        '{"scene": "a", "recording": "b", "station": "/etc/passwd"}',
+        422,
+    ),
+    ("traversal", "POST", "/v1/jobs", VERB, '{"scene": "../../etc", "recording": "b"}', 422),
+    ("traversal in the recording", "POST", "/v1/jobs", VERB, '{"scene": "a", "recording": "../b"}', 422),
+    ("a newline", "POST", "/v1/jobs", VERB, '{"scene": "a\\n", "recording": "b"}', 422),
+    ("an absolute path", "POST", "/v1/jobs", VERB, '{"scene": "a", "recording": "/tmp"}', 422),
+    (
+        "a truth for a number",
+        "POST",
+        "/v1/jobs",
+        VERB,
+        '{"scene": "a", "recording": "b", "views": true}',
+        422,
+    ),
+    ("oversized", "POST", "/v1/jobs", VERB, json.dumps({"scene": "a" * 70000}), 413),
+    ("wrong verb", "DELETE", "/v1/jobs", VERB, "{}", 405),
+    ("no such job", "GET", "/v1/jobs/999999", {}, None, 404),
+    ("a path for a picture", "GET", "/v1/preview/..%2f..%2ftoken", {}, None, 404),
+    ("a word for an event", "GET", "/v1/events?after=x", {}, None, 400),
+]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "headers", "body", "code"), [r[1:] for r in REFUSED], ids=[r[0] for r in REFUSED]
+)
+def test_refused(daemon, method, path, headers, body, code):
+    """What must not be answered is refused with the documented error, as JSON, and changes nothing."""
+    before = daemon.ask("GET", "/v1/jobs")
+    status, answer, _ = daemon.tcp(method, path, headers, body)
+    assert status == code
+    assert set(answer["error"]) == {"kind", "message", "hint"}
+    assert daemon.ask("GET", "/v1/jobs") == before
+
+
+def test_cli_errors_are_told_apart(daemon, tmp_path):
+    """The Unix client turns refusals into the project's errors, and says when no daemon is there."""
+    with pytest.raises(UsageError, match="scene"):
+        daemon.ask("POST", "/v1/jobs", {"recording": "b"})
+    with pytest.raises(DataError):
+        daemon.ask("GET", "/v1/jobs/12345")
+    with pytest.raises(DeviceError, match="no daemon"):
+        ask("GET", "/v1/state", state=tmp_path)
+
+
+def test_record_hands_over(daemon, tmp_path):
+    """A scene of a recording under the daemon's root goes to its queue; any other, or without a daemon, does not."""
+    wish = {"scene": "mug", "views": 2, "frames": 1}
+    assert hand_over(tmp_path / "r", wish, daemon.state) is None
+    assert hand_over(daemon.root / "r", wish, tmp_path) is None
+    job = hand_over(daemon.root / "r", wish, daemon.state)
+    assert (job["recording"], job["state"]) == ("r", "queued")
+    assert daemon.ask("POST", f"/v1/jobs/{job['id']}/cancel")["state"] == "stopped"
+
+
+def test_slow_body_is_cut_off(daemon):
+    """A body that does not come is given up with 408, others are served meanwhile."""
+    head = (
+        f"POST /v1/jobs HTTP/1.1\r\nHost: 127.0.0.1:{daemon.port}\r\nAuthorization: Bearer {daemon.token}\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", daemon.port), timeout=15) as link:
+        link.sendall(
+            f"{head}X-Tofcapture: 1\r\nContent-Type: application/json\r\nContent-Length: 50\r\n\r\n{{".encode()
+        )
+        assert daemon.ask("GET", "/v1/state")["phase"] == "paused"
+        assert link.recv(4096).startswith(b"HTTP/1.1 408")
+
+
+def test_slow_headers_are_cut_off(monkeypatch):
+    """A connection that sends no whole request in time is closed; one that reads no answer too."""
+    from tofcapture.record.daemon import guard
+
+    monkeypatch.setattr(guard, "_IDLE", 0.2)
+
+    async def go():
+        connections = guard.Connections()
+        loop = asyncio.get_running_loop()
+        server = await loop.create_server(
+            lambda: guard.Watched(asyncio.Protocol(), connections), "127.0.0.1", 0
+        )
+        reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+        for _ in range(8):
+            writer.write(b"G")
+            await asyncio.sleep(0.05)
+        try:
+            data = await asyncio.wait_for(reader.read(), 5)
+        except ConnectionError:
+            data = b""
+        writer.close()
+        server.close()
+        return data, len(connections)
+
+    assert asyncio.run(go()) == (b"", 0)
+
+
+def test_openapi_is_what_is_served(daemon):
+    """docs/openapi.json is generated from the schemas that requests are checked against."""
+    stored = json.loads((ROOT / "docs" / "openapi.json").read_text(encoding="utf-8"))
+    assert stored == document() == daemon.ask("GET", "/openapi.json"), "make docs"

@@ -1,0 +1,34 @@
+"""Killed anywhere, disk full at any write: what is sealed stays, nothing is sealed twice, the end is the undisturbed one."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("aiohttp")
+
+SCRIPT = Path(__file__).parents[1] / "benchmarks" / "kill_anywhere.py"
+
+
+def _torment(*options, seconds):
+    command = [sys.executable, SCRIPT, *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=seconds)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return json.loads(done.stdout)
+
+
+def test_a_few_blows_on_a_quick_station():
+    """Three kills and one full disk in a recording of arrays."""
+    told = _torment("--kills", "3", "--full", "1", "--views", "5", "--station", "arrays", seconds=200)
+    assert told["ok"]
+    assert sum(told["blows"].values()) == 4
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_many_blows_on_the_simulated_station():
+    """Daemon, recorder and driver host are all struck, in simulated recordings."""
+    told = _torment("--kills", "30", "--full", "4", "--seed", "3", seconds=1700)
+    assert {"daemon", "recorder", "host"} <= told["blows"].keys()

@@ -1,0 +1,144 @@
+"""Parts of the daemon by themselves: pictures, queue, addresses, what systemd hears, what counts as a full disk."""
+
+import errno
+import os
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.test_daemon_api import STATION
+from tofcapture.cli import main
+from tofcapture.errors import BusyError, ConfigError, DataError, UsageError
+from tofcapture.record.daemon import preview, state, store
+from tofcapture.record.daemon.schema import JOB_WISH, check
+from tofcapture.record.watch import is_full
+
+cv2 = pytest.importorskip("cv2")
+
+
+@pytest.mark.parametrize("shape", [(7, 5), (6, 9, 3), (1, 1)])
+def test_png_is_png(shape):
+    """Another decoder reads back the very pixels."""
+    image = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    read = cv2.imdecode(np.frombuffer(preview.png(image), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(read if image.ndim == 2 else read[..., ::-1], image)
+
+
+def test_pictures_show_near_and_nothing():
+    """Near is red, far is blue, nothing is black; all nothing and all the same are no errors."""
+    depth = np.linspace(0.5, 1.5, 100)[None].repeat(4, axis=0)
+    depth[:, 50] = np.nan
+    picture = preview.colour(depth).astype(int)
+    assert picture[0, 1, 0] > 2 * picture[0, 1, 2]
+    assert picture[0, -2, 2] > 2 * picture[0, -2, 0]
+    assert not picture[:, 50].any()
+    assert not preview.colour(np.full((3, 3), np.nan)).any()
+    assert preview.grey(np.ones((3, 3))).shape == (3, 3)
+    assert max(preview.colour(np.ones((1024, 1280))).shape) <= 320
+
+
+def test_queue_outlives_its_process(tmp_path):
+    """Jobs, events and numbers of events go on where they were; a request id counts once."""
+    wish = {"request_id": "a", "recording": "r", "scene": "s", "views": 2, "frames": 1}
+    queue = store.Store(tmp_path / "q")
+    job, new = queue.add(wish)
+    assert new
+    assert queue.add(wish) == (job, False)
+    queue.move(job.id, "running")
+    first = queue.remember("log", {"text": "x"})
+    queue.close()
+    queue = store.Store(tmp_path / "q")
+    assert queue.next() == replace(job, state="running", changed_utc=queue.next().changed_utc)
+    assert queue.remember("log", {}).id == first.id + 1
+    assert [event.id for event in queue.events(first.id)] == [first.id + 1]
+    with pytest.raises(BusyError):
+        queue.add({**wish, "views": 3})
+    with pytest.raises(DataError):
+        queue.job(99)
+    queue.close()
+    (tmp_path / "bad").write_bytes(b"no database" * 100)
+    with pytest.raises(DataError):
+        store.Store(tmp_path / "bad")
+
+
+@pytest.mark.parametrize(
+    "text", ["0.0.0.0:80", "192.168.0.2:80", "example.org:80", "127.0.0.1", "127.0.0.1:99999", ":80"]
+)
+def test_only_loopback(text):
+    """The daemon listens to no network."""
+    pytest.importorskip("aiohttp")
+    from tofcapture.record.daemon.server import tcp_address
+
+    with pytest.raises(UsageError):
+        tcp_address(text)
+    assert tcp_address("[::1]:80") == ("::1", 80)
+
+
+def test_folder_is_refused_or_made_private(tmp_path):
+    """An open folder is closed, a path too long for a socket is refused, a short token is none."""
+    loose = tmp_path / "loose"
+    loose.mkdir(mode=0o777)
+    folder = state.open_folder(loose)
+    assert loose.stat().st_mode & 0o777 == 0o700
+    assert state.token_of(folder) == state.token_of(folder)
+    folder.token.write_text("short")
+    with pytest.raises(ConfigError, match="token"):
+        state.token_of(folder)
+    with pytest.raises(ConfigError, match="socket"):
+        state.open_folder(tmp_path / ("x" * 120))
+
+
+def test_full_disks_are_told_apart():
+    """Full in the words of the system, of SQLite and of HDF5; other errors are none of it."""
+    assert is_full(OSError(errno.ENOSPC, "x"))
+    assert is_full(sqlite3.OperationalError("database or disk is full"))
+    assert is_full(
+        RuntimeError("Can't decrement id ref count (errno = 28, error message = 'No space left on device')")
+    )
+    assert not is_full(OSError(errno.EIO, "x"))
+    assert not is_full(ValueError("no space left"))
+
+
+def test_whole_numbers_only():
+    """A truth value is no number, a number in range is one."""
+    check(JOB_WISH, {"scene": "a", "recording": "b", "views": 1000})
+    for wrong in (True, 0, 1001, 1.5, "3", None):
+        with pytest.raises(UsageError, match="views"):
+            check(JOB_WISH, {"scene": "a", "recording": "b", "views": wrong})
+
+
+def test_systemd_hears_of_it(tmp_path):
+    """READY, signs of life and STOPPING reach systemd's socket; SIGTERM ends the daemon with 0."""
+    pytest.importorskip("aiohttp")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
+        link.bind(str(tmp_path / "n"))
+        link.settimeout(20)
+        env = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "n"), "WATCHDOG_USEC": "400000"}
+        command = [sys.executable, STATION, "daemon", tmp_path / "root", tmp_path / "st"]
+        process = subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL)
+        heard = []
+        while sum("WATCHDOG=1" in line for line in heard) < 3:
+            heard.append(link.recv(500).decode())
+        process.send_signal(signal.SIGTERM)
+        while not any("STOPPING=1" in line for line in heard):
+            heard.append(link.recv(500).decode())
+        assert process.wait(10) == 0
+    assert any("READY=1" in line for line in heard)
+    assert any("STATUS=idle" in line for line in heard)
+
+
+def test_cli_without_a_daemon(tmp_path, capsys):
+    """``status`` and ``stop`` say that no daemon runs; the unit allows no motion."""
+    assert main(["status", "--state", str(tmp_path)]) == 4
+    assert main(["stop", "--state", str(tmp_path)]) == 4
+    assert "start one" in capsys.readouterr().err
+    assert main(["daemon", "--root", str(tmp_path), "--state", str(tmp_path / "s"), "--print-unit"]) == 0
+    unit = capsys.readouterr().out
+    assert "Type=notify" in unit
+    assert "--allow-motion" not in unit

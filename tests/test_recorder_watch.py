@@ -1,0 +1,178 @@
+"""Who looks on while the recorder works: steps are journaled first, stopping rolls back, a full disk is a state."""
+
+import errno
+import os
+import sqlite3
+
+import pytest
+
+from tests.test_recorder import VIEWS, Bench, _arrays, _few_candidates, _record
+from tofcapture.errors import BusyError, DeviceError
+from tofcapture.frames import ArmInfo
+from tofcapture.record import recorder
+from tofcapture.record.journal import Journal, hold_arm, journal_path
+from tofcapture.record.watch import STEPS, DiskFull, Stopped, Watch
+
+__all__ = ["_few_candidates"]  # applies here too
+
+
+class Witness(Watch):
+    """Notes what it is told, and what the journal says at that moment; stops at the n-th step."""
+
+    def __init__(self, out, stop_at=10**9):
+        self.out, self.stop_at, self.told, self.journaled = out, stop_at, [], []
+
+    def planned(self, plan, kept, repaired):
+        self.told.append(("planned", len(plan.views), sorted(kept), len(repaired)))
+
+    def before_view(self, index):
+        self.told.append(("view", index))
+
+    def step(self, index, step):
+        db = sqlite3.connect(journal_path(self.out))
+        self.journaled.append(db.execute('SELECT step FROM views WHERE "index" = ?', [index]).fetchone()[0])
+        db.close()
+        self.told.append((step, index))
+        if sum(len(t) == 2 and t[0] in STEPS for t in self.told) == self.stop_at:
+            raise Stopped("enough")
+
+    def sealed(self, view, sha256):
+        self.told.append(("sealed", view.index))
+
+    def failed(self, index, reason):
+        self.told.append(("given up", index))
+
+
+def test_every_step_is_journaled_before_it_begins(tmp_path):
+    """Each view: told that it begins, four steps in order, each in the journal already, then sealed; nothing is left begun."""
+    witness = Witness(tmp_path)
+    _record(tmp_path, watch=witness)
+    assert witness.told[0] == ("planned", VIEWS, [], 0)
+    words = [word for word, _ in witness.told[1:]]
+    assert words == ["view", *STEPS, "sealed"] * VIEWS
+    assert witness.journaled == list(STEPS) * VIEWS
+    journal = Journal(tmp_path)
+    assert {row.step for row in journal.rows()} == {""}
+    journal.close()
+
+
+@pytest.mark.parametrize("stop_at", [1, 6, 7, 8, 16])
+def test_stopped_in_a_step(tmp_path, stop_at):
+    """Stopped ahead of any step, the view in hand is rolled back and the next run ends as if never stopped."""
+    _record(tmp_path / "whole")
+    with pytest.raises(Stopped):
+        _record(tmp_path / "r", watch=Witness(tmp_path / "r", stop_at))
+    assert len(list((tmp_path / "r").rglob("*.h5"))) == (stop_at - 1) // 4
+    assert not list((tmp_path / "r").rglob("*.partial"))
+    result = _record(tmp_path / "r")
+    assert any(STEPS[(stop_at - 1) % 4] in line for line in result.repaired)
+    assert _arrays(tmp_path / "r") == _arrays(tmp_path / "whole")
+
+
+def test_a_stopped_arm_is_no_failed_view(tmp_path):
+    """An arm that refuses because it was told to stop ends the run, and no view is given up for it."""
+    bench = Bench()
+
+    class Stopping(Watch):
+        def step(self, index, step):
+            if bench.steps.count("tof"):
+                raise Stopped("told to")
+
+    def refuse(step):
+        if step == "tof":
+            raise DeviceError("stopped")
+
+    bench.before = refuse
+    with pytest.raises(Stopped):
+        _record(tmp_path, bench, watch=Stopping())
+    journal = Journal(tmp_path)
+    assert {row.state for row in journal.rows()} == {"planned"}
+    journal.close()
+
+
+@pytest.mark.parametrize("number", range(1, 44, 6))
+def test_disk_full_at_any_write(tmp_path, monkeypatch, number):
+    """Full from any write on, the run ends as ``DiskFull``, no view fails for it, and with room again all is as if never full."""
+    _record(tmp_path / "whole")
+    count = iter(range(1, 10_000))
+
+    def full(real, error):
+        def write(*args, **more):
+            if next(count) >= number:
+                raise error
+            return real(*args, **more)
+
+        return write
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full(os.fsync, OSError(errno.ENOSPC, "No space left on device")))
+        patch.setattr(
+            Journal, "_set", full(Journal._set, sqlite3.OperationalError("database or disk is full"))
+        )
+        patch.setattr(
+            recorder, "write_view", full(recorder.write_view, RuntimeError("No space left on device"))
+        )
+        with pytest.raises(DiskFull):
+            _record(tmp_path / "r")
+    assert not list((tmp_path / "r").rglob("*.h5.partial"))
+    assert not _record(tmp_path / "r").failed
+    assert not list((tmp_path / "r" / "views").rglob("*.partial"))
+    assert _arrays(tmp_path / "r") == _arrays(tmp_path / "whole")
+
+
+def test_the_disk_fills_between_views(tmp_path, monkeypatch):
+    """Room is looked for before every view, not only at the start."""
+    real, calls = recorder.shutil.disk_usage, []
+
+    def usage(path):
+        calls.append(path)
+        found = real(path)
+        return found if len(calls) < 3 else found._replace(free=10**6)
+
+    monkeypatch.setattr(recorder.shutil, "disk_usage", usage)
+    with pytest.raises(DiskFull):
+        _record(tmp_path)
+    assert len(list(tmp_path.rglob("*.h5"))) == 1
+
+
+def test_what_is_set_aside_stays(tmp_path):
+    """A second damaged file of the same view does not take the place of the first."""
+    _record(tmp_path)
+    view = tmp_path / "views" / "mug" / "view-001.h5"
+    for content in (b"first", b"second"):
+        view.unlink()
+        view.write_bytes(content)
+        for path in tmp_path.glob("journal.sqlite*"):
+            path.unlink()
+        assert _record(tmp_path).recorded == (1,)
+    kept = sorted(path.read_bytes() for path in view.parent.glob("*.damaged*"))
+    assert kept == [b"first", b"second"]
+
+
+def test_older_journals_grow(tmp_path):
+    """A journal without steps is taken on."""
+    _record(tmp_path, views=2)
+    db = sqlite3.connect(journal_path(tmp_path))
+    db.execute("ALTER TABLE views DROP COLUMN step")
+    db.close()
+    result = _record(tmp_path)
+    assert (result.kept, len(result.recorded)) == ((0, 1), VIEWS - 2)
+
+
+def test_a_real_arm_has_one_master(tmp_path, monkeypatch):
+    """Two recorders of two recordings do not move one real arm; of simulated ones there are plenty."""
+
+    class Real:
+        simulated = False
+
+        def describe(self):
+            return ArmInfo("ur10e", f"serial {os.getpid()} {tmp_path}")
+
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with hold_arm(Real()), pytest.raises(BusyError, match="ur10e"), hold_arm(Real()):
+        pass
+    with hold_arm(Real()):
+        pass
+    Real.simulated = True
+    with hold_arm(Real()), hold_arm(Real()):
+        pass

@@ -1,0 +1,97 @@
+"""Asks a running daemon over its Unix socket; the standard library is enough."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tofcapture.errors import BusyError, DataError, DeviceError, TofError, UsageError
+from tofcapture.record.daemon.state import StateFolder, default_folder
+
+_TIMEOUT = 5.0  # s
+_KINDS = {404: DataError, 409: BusyError, 422: UsageError}
+
+
+class _UnixConnection(http.client.HTTPConnection):
+    def __init__(self, path: Path) -> None:
+        super().__init__("localhost", timeout=_TIMEOUT)
+        self._path = path
+
+    def connect(self) -> None:
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.sock.settimeout(_TIMEOUT)
+        self.sock.connect(str(self._path))
+
+
+def hand_over(recording: Path, wish: Mapping[str, Any], state: Path | None = None) -> dict[str, Any] | None:
+    """Queue a scene with the daemon that keeps a recording, if there is one.
+
+    Parameters
+    ----------
+    recording
+        Folder to record into.
+    wish
+        ``scene``, ``views``, ``frames``, and ``seed`` when it is given.
+    state
+        The daemon's folder; the default one for ``None``.
+
+    Returns
+    -------
+    The job; ``None`` when no daemon runs, or its recordings lie elsewhere.
+
+    Raises
+    ------
+    UsageError, BusyError
+        The daemon refuses.
+    """
+    try:
+        root = Path(ask("GET", "/v1/state", state=state)["root"])
+    except DeviceError:
+        return None
+    where = recording.resolve()
+    if where.parent != root:
+        return None
+    return ask("POST", "/v1/jobs", {**wish, "recording": where.name}, state)
+
+
+def ask(
+    method: str, path: str, body: Mapping[str, Any] | None = None, state: Path | None = None
+) -> dict[str, Any]:
+    """Ask the daemon.
+
+    Parameters
+    ----------
+    method, path, body
+        For example ``"POST", "/v1/jobs", {"scene": "mug", "recording": "mugs"}``.
+    state
+        The daemon's folder; the default one for ``None``.
+
+    Raises
+    ------
+    DeviceError
+        No daemon answers.
+    UsageError, BusyError, DataError, TofError
+        It refuses, in its words.
+    """
+    folder = StateFolder((state or default_folder()).absolute())
+    link = _UnixConnection(folder.socket)
+    headers = {"X-Tofcapture": "1", "Content-Type": "application/json"}
+    try:
+        link.request(method, path, None if method == "GET" else json.dumps(body or {}), headers)
+        answer = link.getresponse()
+        found: dict[str, Any] = json.loads(answer.read())
+    except (OSError, ValueError, http.client.HTTPException) as err:
+        raise DeviceError(
+            f"no daemon answers at {folder.socket}: {err}",
+            hint="start one: tofcapture daemon --root FOLDER; or name its folder with --state",
+        ) from err
+    finally:
+        link.close()
+    if answer.status >= 400:
+        error = found["error"]
+        raise _KINDS.get(answer.status, TofError)(error["message"], error["hint"])
+    return found

@@ -1,0 +1,105 @@
+"""Server-sent events: every client gets what happens, from where it left off; a slow one is dropped, never waited for."""
+
+from __future__ import annotations
+
+import asyncio
+
+from aiohttp import web
+
+from tofcapture.record.daemon.guard import HEADERS, Connections, refusal
+from tofcapture.record.daemon.store import Event, Store
+
+MOST_STREAMS = 512
+_BACKLOG = 256  # events that a client may be behind
+_QUIET = 15.0  # s without an event until a comment shows that the line stands
+_WRITE = 20.0  # s that a client may take to read
+
+
+class Streams:
+    """All open event streams."""
+
+    def __init__(self, store: Store, connections: Connections) -> None:
+        self._store, self._connections = store, connections
+        self._queues: set[asyncio.Queue[tuple[int, bytes] | None]] = set()
+        self._closed = False
+
+    def __len__(self) -> int:
+        return len(self._queues)
+
+    def publish(self, event: Event) -> None:
+        """Hand an event to every client; encoded once."""
+        item = (event.id, event.text())
+        for queue in self._queues:
+            if queue.qsize() < _BACKLOG:
+                queue.put_nowait(item)
+            else:
+                _end(queue)
+
+    def close(self) -> None:
+        """End all streams; clients come back when there is a daemon again."""
+        self._closed = True
+        for queue in self._queues:
+            _end(queue)
+
+    async def serve(self, request: web.Request) -> web.StreamResponse:
+        """Stream to one client until it leaves."""
+        if self._closed or len(self._queues) >= MOST_STREAMS:
+            return refusal(503, "streams", f"expected at most {MOST_STREAMS} event streams")
+        after = _after(request)
+        response = web.StreamResponse(headers={**HEADERS, "Content-Type": "text/event-stream"})
+        queue: asyncio.Queue[tuple[int, bytes] | None] = asyncio.Queue()
+        self._queues.add(queue)
+        try:
+            await response.prepare(request)
+            await self._feed(response, queue, after)
+        except (ConnectionError, TimeoutError):
+            pass
+        finally:
+            self._queues.discard(queue)
+        return response
+
+    async def _feed(
+        self, response: web.StreamResponse, queue: asyncio.Queue[tuple[int, bytes] | None], after: int | None
+    ) -> None:
+        last = self._store.last_event() if after is None else after
+        await _write(response, b"retry: 1000\n: hello\n\n")
+        for event in self._store.events(last) if after is not None else ():
+            await _write(response, event.text())
+            last = event.id
+        while (items := await _next(queue)) is not None:
+            if text := b"".join(text for number, text in items if number == 0 or number > last):
+                await _write(response, text)
+
+
+async def _next(queue: asyncio.Queue[tuple[int, bytes] | None]) -> list[tuple[int, bytes]] | None:
+    """All events that wait, in one piece; a comment when there are none for a while, ``None`` when the stream ends."""
+    items: list[tuple[int, bytes] | None] = []
+    try:
+        async with asyncio.timeout(_QUIET):
+            items.append(await queue.get())
+    except TimeoutError:
+        return [(0, b": alive\n\n")]
+    while not queue.empty():
+        items.append(queue.get_nowait())
+    return None if None in items else [item for item in items if item is not None]
+
+
+def _end(queue: asyncio.Queue[tuple[int, bytes] | None]) -> None:
+    while not queue.empty():
+        queue.get_nowait()
+    queue.put_nowait(None)
+
+
+async def _write(response: web.StreamResponse, text: bytes) -> None:
+    async with asyncio.timeout(_WRITE):
+        await response.write(text)
+
+
+def _after(request: web.Request) -> int | None:
+    """Where a client left off; ``None`` when it wants only what is new."""
+    given = request.query.get("after", request.headers.get("Last-Event-ID"))
+    if given is None:
+        return None
+    if not (given.isascii() and given.isdigit() and len(given) <= 16):
+        raise web.HTTPBadRequest(reason="after: expected the number of an event")
+    return int(given)

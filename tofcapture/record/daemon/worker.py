@@ -1,0 +1,239 @@
+"""The recorder's own process: reads its job and orders from stdin, tells what it does on stdout, one JSON object a line.
+
+Orders: ``{"do": "pause" | "resume" | "stop" | "confirm"}``. When stdin ends the daemon is gone: the arm is stopped and the
+process ends. Whatever libraries print goes to stderr.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+from tofcapture.errors import BusyError, DeviceError, MotionRefused, TofError
+from tofcapture.frames import Truth, View
+from tofcapture.record.watch import DiskFull, Stopped, Watch
+
+if TYPE_CHECKING:
+    from tofcapture.devices.station import Station
+    from tofcapture.record.plan import Plan
+
+ALIVE = 0.5  # s between signs of life
+_LAST_WORDS = 2.0  # s that the recorder has to notice that it shall end
+_PATIENCE = 1800.0  # s that an operator may take to place a scene
+
+
+class Link:
+    """Both ends of the line to the daemon.
+
+    Parameters
+    ----------
+    orders, out
+        Text files of one JSON object a line.
+    """
+
+    def __init__(self, orders: TextIO, out: TextIO) -> None:
+        self._orders, self._out = orders, out
+        self._lock = threading.Lock()
+        self._changed = threading.Condition()
+        self.paused = self.stopped = self.confirmed = False
+        self.station: Station | None = None
+
+    def tell(self, kind: str, **data: object) -> None:
+        """Say that something happened; the daemon's absence is noticed elsewhere."""
+        with self._lock:
+            try:
+                self._out.write(json.dumps({"kind": kind, **data}, allow_nan=False) + "\n")
+                self._out.flush()
+            except (OSError, ValueError):
+                self.stopped = True
+
+    def listen(self) -> None:
+        """Follow orders until the line ends; then stop the arm and the process. Runs in a thread of its own."""
+        for line in self._orders:
+            self._follow(json.loads(line)["do"])
+        self._follow("stop")
+        threading.Event().wait(_LAST_WORDS)
+        os._exit(3)
+
+    def _follow(self, order: str) -> None:
+        with self._changed:
+            self.stopped |= order == "stop"
+            self.paused = order == "pause" or (self.paused and order != "resume")
+            self.confirmed |= order == "confirm"
+            self._changed.notify_all()
+        if order == "stop" and (station := self.station) is not None:
+            station.arm.stop()
+
+    def check(self) -> None:
+        """Raise :class:`Stopped` when the recorder shall end."""
+        if self.stopped:
+            raise Stopped("stopped by the operator", hint="ask for the same scene again to go on")
+
+    def rest(self) -> None:
+        """Wait while paused."""
+        self.check()
+        if not self.paused:
+            return
+        self.tell("paused")
+        with self._changed:
+            self._changed.wait_for(lambda: self.stopped or not self.paused)
+        self.check()
+        self.tell("resumed")
+
+    def ask(self, scene: str) -> None:
+        """Wait until a person says that the scene is placed.
+
+        Raises
+        ------
+        DeviceError
+            Nobody answers: the arm stays where it is.
+        """
+        self.confirmed = False
+        self.tell("ask", scene=scene)
+        with self._changed:
+            heard = self._changed.wait_for(lambda: self.stopped or self.confirmed, _PATIENCE)
+        self.check()
+        if not heard:
+            raise DeviceError(
+                f"nobody confirmed within {_PATIENCE / 60:.0f} minutes that {scene!r} is placed",
+                hint="place it, then resume",
+            )
+        self.tell("answered", scene=scene)
+
+    def show_life(self) -> None:
+        """Say every half second that this process lives. Runs in a thread of its own."""
+        while True:
+            self.tell("alive")
+            threading.Event().wait(ALIVE)
+
+
+class PageOperator:
+    """The person at the page, who puts scenes on the table when asked."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+
+    def place(self, scene: str) -> None:
+        """Ask and wait."""
+        self._link.ask(scene)
+
+    def truth(self) -> Truth | None:
+        """Nobody knows the real world exactly."""
+        return None
+
+
+class Reporter(Watch):
+    """Tells the daemon what the recorder does; passes pause and stop on to it."""
+
+    def __init__(self, link: Link, previews: Path) -> None:
+        self._link, self._previews = link, previews
+
+    def planned(self, plan: Plan, kept: set[int], repaired: list[str]) -> None:
+        """Tell the plan."""
+        views = [
+            {
+                "index": v.index,
+                "direction": [round(float(x), 4) for x in v.direction],
+                "distance": round(v.distance, 4),
+                "state": "sealed" if v.index in kept else "planned",
+            }
+            for v in plan.views
+        ]
+        self._link.tell("planned", views=views, wanted=plan.wanted, repaired=repaired)
+
+    def before_view(self, index: int) -> None:
+        """Rest while paused."""
+        del index
+        self._link.rest()
+
+    def step(self, index: int, step: str) -> None:
+        """Tell the step, unless it must not be taken any more."""
+        self._link.check()
+        self._link.tell("step", index=index, step=step)
+
+    def sealed(self, view: View, sha256: str) -> None:
+        """Tell what a view is like; pictures that cannot be made are no reason to lose a recording."""
+        from tofcapture.record.daemon.preview import quality, save
+
+        found: dict[str, Any] = {}
+        try:
+            save(view, self._previews)
+            found = quality(view)
+        except (OSError, TofError, ValueError) as err:
+            self._link.tell("log", text=f"no preview of view {view.index}: {err}")
+        self._link.tell("sealed", index=view.index, sha256=sha256, quality=found)
+
+    def failed(self, index: int, reason: str) -> None:
+        """Tell why a view was given up."""
+        self._link.tell("failed", index=index, reason=reason)
+
+
+def _work(job: Mapping[str, Any], link: Link) -> dict[str, Any]:
+    """Open the station, record, and say what came of it."""
+    from tofcapture.devices.station import open_station
+    from tofcapture.record.recorder import record
+
+    path = Path(job["station"]) if job["station"] else None
+    with open_station(path, job["seed"], allow_motion=job["allow_motion"]) as station:
+        link.station = station
+        if not (station.simulated or job["allow_motion"]):
+            raise MotionRefused(
+                f"the arm {station.arm.describe().model} is real and the daemon was started without --allow-motion",
+                hint="look at record --dry-run, clear the workspace, then start the daemon with --allow-motion",
+            )
+        link.tell("opened", station=station.describe(), simulated=station.simulated)
+        asks = station.config.get("operator", {}).get("driver") == "console"
+        staffed = replace(station, operator=PageOperator(link)) if asks else station
+        watch = Reporter(link, Path(job["previews"]))
+        result = record(
+            staffed, job["scene"], Path(job["recording"]), job["views"], job["frames"], watch=watch
+        )
+    taken, kept, failed = (list(x) for x in (result.recorded, result.kept, result.failed))
+    return {"recorded": taken, "kept": kept, "failed": failed, "reasons": list(result.reasons)}
+
+
+def _error(err: BaseException) -> dict[str, Any]:
+    """What the daemon must know of an error: the words, and whether a person can lift what caused it."""
+    message = err.message if isinstance(err, TofError) else f"{type(err).__name__}: {err}"
+    lifted = isinstance(err, (DeviceError, BusyError, DiskFull))
+    return {
+        "message": message,
+        "hint": getattr(err, "hint", ""),
+        "name": type(err).__name__,
+        "lifted": lifted,
+    }
+
+
+def main() -> None:
+    """Run one job."""
+    # systemd signals the whole group: the daemon decides what it means. Driver hosts inherit this.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    job = json.loads(sys.stdin.readline())
+    link = Link(sys.stdin, out)
+    for task in (link.listen, link.show_life):
+        threading.Thread(target=task, daemon=True).start()
+    try:
+        link.tell("done", **_work(job, link))
+    except Stopped:
+        link.tell("stopped")
+    except Exception as err:
+        if not isinstance(err, TofError):
+            traceback.print_exc()
+        link.tell("error", **_error(err))
+    # A thread sits in a read of stdin, and a vendor library may crash while it unwinds: everything is on disk.
+    sys.stderr.flush()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()
