@@ -17,6 +17,7 @@ from tofcapture.devices.kinematics import (
 )
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.sim.arm import SimArm
+from tofcapture.devices.sim.faults import FaultPlan, Faults
 from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.poses import check_transform, rotation_angle, transform
 
@@ -102,6 +103,7 @@ class _World:
 
     def __init__(self):
         self.poses = []
+        self.faults = Faults(FaultPlan())
 
     def set_pose(self, T_base_flange, key):
         self.poses.append((T_base_flange, key))
