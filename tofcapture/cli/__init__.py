@@ -24,11 +24,20 @@ ORDER = (
     "demo",
     "doctor",
     "record",
+    "daemon",
+    "status",
+    "stop",
     "simulate",
+    "simulate-dataset",
     "align",
     "calibrate",
     "build-dataset",
     "check",
+    "migrate",
+    "stats",
+    "view",
+    "pack",
+    "export-dataset",
     "train",
     "evaluate",
     "predict",
@@ -61,8 +70,17 @@ def _load(entry: EntryPoint) -> Command:
     return command
 
 
-def parser(commands: dict[str, Command]) -> argparse.ArgumentParser:
-    """Build the parser of the given commands."""
+def parser(commands: dict[str, Command], *, named: bool = True) -> argparse.ArgumentParser:
+    """Build the parser of the given commands.
+
+    Parameters
+    ----------
+    commands
+        By name.
+    named
+        The command line names one of them. Without it only the list of commands is of use, and no command declares arguments: some
+        import numpy for that.
+    """
     top = _Parser(prog="tofcapture", description=DESCRIPTION, epilog=EXIT_CODES)
     top.add_argument("--version", action="version", version=f"tofcapture {__version__}")
     subs = top.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
@@ -74,7 +92,8 @@ def parser(commands: dict[str, Command]) -> argparse.ArgumentParser:
             epilog=f"example:\n  {command.example}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        command.configure(sub)
+        if named:
+            command.configure(sub)
         sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     return top
 
@@ -83,7 +102,7 @@ def _run(argv: Sequence[str]) -> Outcome:
     entries = _found()
     named = next((a for a in argv if not a.startswith("-")), None)
     wanted = {named: entries[named]} if named in entries else entries
-    top = parser({name: _load(entry) for name, entry in wanted.items()})
+    top = parser({name: _load(entry) for name, entry in wanted.items()}, named=named in entries)
     args = top.parse_args(argv)
     if args.command is None:
         return Outcome(text=top.format_help().rstrip())

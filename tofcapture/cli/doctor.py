@@ -1,32 +1,47 @@
-"""``tofcapture doctor``: see whether everything is here that capturing, building and training need."""
+"""``tofcapture doctor``: see whether everything is here that capturing, building and training need.
+
+What may hang or crash (vendor libraries, open3d, third-party drivers, devices) is looked at in processes of their own, all at the
+same time; this process imports none of it.
+"""
 
 from __future__ import annotations
 
 import argparse
-import os
 import platform
 import shutil
 import sqlite3
 import sys
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from tofcapture.cli.doctor_probe import Finding, probe
 from tofcapture.command import Command, Outcome
-from tofcapture.errors import TofError
+from tofcapture.errors import ConfigError, TofError
 
 _ORDER = ("FAIL", "WARN", "PASS")
+Check = Callable[[], list[Finding]]
 
-
-@dataclass(frozen=True)
-class Finding:
-    """One line of the doctor: what was looked at, PASS, WARN or FAIL, what was found, and what to do."""
-
-    what: str
-    verdict: str
-    found: str
-    advice: str = ""
+REQUIRED = {"numpy": "1.26", "h5py": "3.10"}
+OPTIONAL = {
+    "scipy": ("1.11", "capture"),
+    "numba": ("0.60", "capture"),
+    "threadpoolctl": ("3.1", "capture"),
+    "rich": ("13", "capture"),
+    "tomli-w": ("1.0", "capture"),
+    "jinja2": ("3.1", "capture"),
+    "kiss-icp": ("1.2", "capture"),
+    "aiohttp": ("3.10", "daemon"),
+    "pyserial": ("3.5", "hardware"),
+    "distributed": ("2024.1", "cluster"),
+    "small-gicp": ("1.0", "gicp"),
+    "torch": ("2.6", "model"),
+    "safetensors": ("0.5", "model"),
+    "tensorboard": ("2.18", "train"),
+    "matplotlib": ("3.8", "report"),
+}
 
 
 def _installed(name: str) -> str | None:
@@ -49,26 +64,38 @@ def check_python() -> list[Finding]:
     """Python itself."""
     found = platform.python_version()
     ok = sys.version_info >= (3, 11)
-    return [Finding("python", "PASS" if ok else "FAIL", found, "" if ok else "install Python 3.11 or newer")]
+    here = Finding("python", "PASS" if ok else "FAIL", found, "" if ok else "install Python 3.11 or newer")
+    return [here, *_own_version()]
+
+
+def _own_version() -> list[Finding]:
+    """Look at the package, as it runs and as it is installed, and at its program."""
+    from tofcapture import __version__
+
+    installed = _installed("tofcapture")
+    if installed is None:
+        found = Finding("tofcapture", "FAIL", f"{__version__} runs, but is not installed", "pip install .")
+    elif installed != __version__:
+        found = Finding(
+            "tofcapture", "FAIL", f"{__version__} runs, {installed} is installed", "install again"
+        )
+    else:
+        found = Finding("tofcapture", "PASS", __version__)
+    program = shutil.which("tofcapture")
+    if program is None:
+        return [
+            found,
+            Finding("program", "WARN", "tofcapture is not on the PATH", "activate its environment"),
+        ]
+    return [found, Finding("program", "PASS", program)]
 
 
 def check_libraries() -> list[Finding]:
     """Versions of libraries: the two that everything needs, and those of the extras."""
-    required = {"numpy": "1.26", "h5py": "3.10"}
-    optional = {
-        "scipy": ("1.11", "capture"),
-        "rich": ("13", "capture"),
-        "tomli-w": ("1.0", "capture"),
-        "kiss-icp": ("1.2", "capture"),
-        "torch": ("2.6", "model"),
-        "safetensors": ("0.5", "model"),
-        "matplotlib": ("3.8", "report"),
-        "jinja2": ("3.1", "report"),
-    }
-    out = [_library(name, least, "FAIL", "pip install tofcapture") for name, least in required.items()]
+    out = [_library(name, least, "FAIL", "pip install tofcapture") for name, least in REQUIRED.items()]
     return out + [
         _library(n, least, "WARN", f"pip install 'tofcapture[{extra}]'")
-        for n, (least, extra) in optional.items()
+        for n, (least, extra) in OPTIONAL.items()
     ]
 
 
@@ -118,42 +145,6 @@ def check_torch() -> list[Finding]:
     return [Finding("torchvision", "PASS", f"{vision}, matches torch {torch}")]
 
 
-def check_open3d() -> list[Finding]:
-    """open3d: does it load? A missing libusb is its usual trouble."""
-    from tofcapture.o3d import load_open3d
-
-    try:
-        return [Finding("open3d", "PASS", str(load_open3d().__version__))]
-    except TofError as err:
-        missing = _installed("open3d") is None and _installed("open3d-cpu") is None
-        return [Finding("open3d", "WARN" if missing else "FAIL", err.message, err.hint)]
-
-
-def check_disk(folder: Path) -> list[Finding]:
-    """Space and write permission where recordings would go."""
-    free = shutil.disk_usage(folder).free / 1e9
-    # A scene of 25 views takes 0.3 to 0.6 GB.
-    verdict = "PASS" if free > 5 else "WARN" if free > 1 else "FAIL"
-    out = [
-        Finding(
-            "disk",
-            verdict,
-            f"{free:.1f} GB free in {folder}",
-            "" if verdict == "PASS" else "a scene takes 0.5 GB: free some",
-        )
-    ]
-    writable = os.access(folder, os.W_OK)
-    return [
-        *out,
-        Finding(
-            "folder",
-            "PASS" if writable else "WARN",
-            f"{folder} {'can' if writable else 'cannot'} be written",
-            "" if writable else "change to a folder of yours",
-        ),
-    ]
-
-
 def check_sqlite() -> list[Finding]:
     """SQLite, for the journal: upserts came with 3.24."""
     ok = sqlite3.sqlite_version_info >= (3, 24)
@@ -167,55 +158,80 @@ def check_sqlite() -> list[Finding]:
     ]
 
 
-def check_drivers() -> list[Finding]:
-    """Device drivers: which there are, which do not import."""
-    from tofcapture.devices.registry import found_drivers, load_driver
+def machine_checks(folder: Path) -> list[Check]:
+    """Checks of this machine, in this process."""
+    from tofcapture.cli import doctor_machine as machine
 
-    out = []
-    for name, entry in found_drivers().items():
-        try:
-            out.append(Finding(f"driver {name}", "PASS", ", ".join(sorted(load_driver(name)))))
-        except TofError as err:
-            out.append(
-                Finding(
-                    f"driver {name}", "WARN", err.message, f"repair or uninstall what provides {entry.value}"
-                )
-            )
-    return out or [
-        Finding("drivers", "FAIL", "none is installed", "install the package: pip install tofcapture")
+    return [
+        lambda: machine.check_disk(folder),
+        machine.check_clock,
+        machine.check_memory,
+        machine.check_ports,
+        machine.check_daemon,
     ]
 
 
-CHECKS: tuple[Callable[[], list[Finding]], ...] = (
-    check_python,
-    check_libraries,
-    check_opencv,
-    check_torch,
-    check_open3d,
-    check_sqlite,
-    lambda: check_disk(Path.cwd()),
-    check_drivers,
+CHECKS: tuple[Check, ...] = (check_python, check_libraries, check_opencv, check_torch, check_sqlite)
+
+PROBES: tuple[Check, ...] = (
+    lambda: probe("open3d"),
+    lambda: probe("ur-rtde"),
+    lambda: probe("nxlib"),
+    lambda: probe("drivers"),
+    lambda: probe("commands"),
 )
 
 
-def examine() -> list[Finding]:
-    """Make all checks; a check that breaks is itself a FAIL."""
-    out: list[Finding] = []
-    for check in CHECKS:
-        try:
-            out += check()
-        except Exception as err:
-            out.append(Finding(getattr(check, "__name__", "check"), "FAIL", f"{type(err).__name__}: {err}"))
-    return out
+def examine(checks: Sequence[Check]) -> list[Finding]:
+    """Make checks one after the other; one that breaks is itself a FAIL."""
+    return [finding for check in checks for finding in _made(check)]
+
+
+def examine_together(checks: Sequence[Check]) -> list[Finding]:
+    """The same for checks that wait for other processes, all at once."""
+    with ThreadPoolExecutor(max_workers=max(1, len(checks))) as pool:
+        return [finding for found in pool.map(_made, checks) for finding in found]
+
+
+def _made(check: Check) -> list[Finding]:
+    try:
+        return check()
+    except Exception as err:
+        hint = err.hint if isinstance(err, TofError) else ""
+        name = getattr(check, "__name__", "check")
+        return [
+            Finding(name, "FAIL", f"{type(err).__name__}: {err}", hint or "this is a fault of the doctor")
+        ]
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    del parser
+    parser.add_argument(
+        "--station", type=Path, metavar="TOML", help="look at its devices too, without opening them"
+    )
+    parser.add_argument(
+        "--open", action="store_true", help="open the station's devices as well; nothing moves"
+    )
+    parser.add_argument(
+        "--folder", type=Path, default=Path(), help="where recordings would go (default: here)"
+    )
 
 
 def _run(args: argparse.Namespace) -> Outcome:
-    del args
-    findings = examine()
+    folder = args.folder.absolute()
+    station = str(args.station) if args.station else ""
+    # A UR arm's handshake may take seconds at each of its stages.
+    devices = [
+        lambda: probe("station", station, "open" if args.open else "", timeout=180.0 if args.open else 90.0)
+    ]
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: expected a folder", hint="make it, or name another with --folder")
+    probed = examine_together([*PROBES, *devices])
+    # The disk's speed is measured when nothing else runs.
+    return _outcome([*examine(CHECKS), *probed, *examine(machine_checks(folder))])
+
+
+def _outcome(findings: Iterable[Finding]) -> Outcome:
+    findings = list(findings)
     width = max(len(f.what) for f in findings)
     lines = [
         f"{f.verdict}  {f.what:{width}}  {f.found}"

@@ -1,4 +1,7 @@
-"""``tofcapture record``: take the views of a scene, or of the calibration board."""
+"""``tofcapture record``: take the views of a scene, or of the calibration board.
+
+A running daemon that keeps the recording gets the work; otherwise the recorder runs here.
+"""
 
 from __future__ import annotations
 
@@ -45,10 +48,27 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, help="seed of the simulated world and of the view plan")
     parser.add_argument(
-        "--dry-run", action="store_true", help="print the plan; nothing moves, nothing is written"
+        "--turns",
+        type=int,
+        default=1,
+        metavar="N",
+        help="have the object turned by hand between views, N ways in all (default 1: it stays)",
     )
     parser.add_argument(
-        "--allow-motion", action="store_true", help="let a real arm move (rehearse the plan first)"
+        "--dry-run",
+        action="store_true",
+        help="print the plan and draw it; nothing moves, nothing is recorded",
+    )
+    parser.add_argument(
+        "--picture", type=Path, metavar="SVG", help="where --dry-run draws it (default: beside RECORDING)"
+    )
+    parser.add_argument(
+        "--allow-motion",
+        action="store_true",
+        help="let a real arm move in this run (rehearse the plan first); simulated arms need no leave",
+    )
+    parser.add_argument(
+        "--foreground", action="store_true", help="record here, also when a daemon keeps this recording"
     )
 
 
@@ -60,15 +80,19 @@ def _run(args: argparse.Namespace) -> Outcome:
 
     scene = CALIBRATION if args.calibration else args.scene
     views = args.views if args.views is not None else _BOARD_VIEWS if args.calibration else _SCENE_VIEWS
-    with open_station(args.station, args.seed) as station:
+    if (handed := _handed_over(args, scene, views)) is not None:
+        return handed
+    with open_station(args.station, args.seed, allow_motion=args.allow_motion) as station:
         if args.dry_run:
-            return _planned(scene, plan_scene(station, scene, views))
+            return _planned(args, scene, station, plan_scene(station, scene, views, args.turns))
         _check_motion(station, allowed=args.allow_motion)
         with progress_line(f"record {scene}") as progress:
             show = progress
             if args.calibration:
                 show = _metered(progress, station, args.out, plan_scene(station, scene, views))
-            result = record(station, scene, args.out, views=views, frames=args.frames, progress=show)
+            result = record(
+                station, scene, args.out, views=views, frames=args.frames, progress=show, turns=args.turns
+            )
     return _recorded(args.out, result)
 
 
@@ -102,28 +126,64 @@ def _check_motion(station: Station, *, allowed: bool) -> None:
         )
 
 
-def _planned(scene: str, plan: Plan) -> Outcome:
-    rows = [
-        f"{v.index:4d}  {v.distance:8.3f} m  {' '.join(f'{x:+6.3f}' for x in v.direction)}   {' '.join(f'{x:+7.3f}' for x in v.joints)}"
-        for v in plan.views
-    ]
-    head = "view    distance  direction from target    joints (rad)"
+def _handed_over(args: argparse.Namespace, scene: str, views: int) -> Outcome | None:
+    """Give the work to a daemon; ``None`` when there is none for it, or something was asked for that only works here."""
+    if args.dry_run or args.foreground or args.station is not None or args.turns != 1:
+        return None
+    from tofcapture.record.daemon.client import hand_over
+
+    wish = {"scene": scene, "views": views, "frames": args.frames}
+    if args.seed is not None:
+        wish["seed"] = args.seed
+    job = hand_over(args.out, wish)
+    if job is None:
+        return None
+    text = f"job {job['id']} of the daemon that keeps {args.out}: {job['state']}. tofcapture status shows how it goes."
+    return Outcome(data={"ok": True, "recording": str(args.out), "scene": scene, "job": job}, text=text)
+
+
+def _planned(args: argparse.Namespace, scene: str, station: Station, plan: Plan) -> Outcome:
+    """Print the plan, draw it."""
+    from tofcapture.files.seal import write_text
+    from tofcapture.record.clearance import stage_of
+    from tofcapture.record.picture import plan_svg
+
+    stage = stage_of(station.config)
+    picture = args.picture or args.out.parent / f"{args.out.name}-{scene}-plan.svg"
+    target = stage.board if args.calibration else stage.target
+    title = f"{scene}: {len(plan.views)} views, {station.arm.describe().model}"
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    write_text(picture, plan_svg(plan, stage, station.rig, target, title))
     return Outcome(
-        data={"ok": True, "scene": scene, "plan": plan.table()}, text="\n".join([plan.summary(), head, *rows])
+        data={"ok": True, "scene": scene, "plan": plan.table(), "picture": str(picture)},
+        text="\n".join([plan.summary(), *_plan_rows(plan), *plan.shortfall(), f"drawn in {picture}"]),
     )
+
+
+def _plan_rows(plan: Plan) -> list[str]:
+    """One line for each view, in the order of travel."""
+    import math
+
+    rows = ["view   turn  distance   tilt   from    joints (deg)"]
+    for v in plan.views:
+        x, y, z = (float(c) for c in v.direction)
+        tilt, side = math.degrees(math.acos(min(1.0, z))), math.degrees(math.atan2(y, x))
+        joints = " ".join(f"{math.degrees(q):+7.1f}" for q in v.joints)
+        turn = math.degrees(v.turn)
+        rows.append(f"{v.index:4d}  {turn:5.0f}  {v.distance:6.3f} m  {tilt:5.0f}  {side:+5.0f}   {joints}")
+    return rows
 
 
 def _recorded(recording: Path, result: RecordResult) -> Outcome:
     taken, kept = len(result.recorded), len(result.kept)
-    lines = [*result.repaired, *result.reasons]
+    lines = [*result.repaired, *result.reasons, *result.notes]
     if not taken and not result.failed:
         lines.append(f"nothing to record: {kept} views of {result.scene!r} are there")
     else:
         lines.append(
             f"{taken} views of {result.scene!r} recorded, {kept} were there, {len(result.failed)} failed: {recording}"
         )
-    if len(result.plan.views) < result.plan.wanted:
-        lines.append(f"the arm reaches no more: {result.plan.summary()}")
+    lines += result.plan.shortfall()
     data: dict[str, Any] = {
         "ok": not result.failed,
         "recording": str(recording),
@@ -132,6 +192,7 @@ def _recorded(recording: Path, result: RecordResult) -> Outcome:
         "kept": list(result.kept),
         "failed": list(result.failed),
         "reasons": list(result.reasons),
+        "notes": list(result.notes),
         "repaired": list(result.repaired),
         "plan": {"digest": result.plan.digest, "views": len(result.plan.views), "wanted": result.plan.wanted},
     }

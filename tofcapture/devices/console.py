@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TextIO
@@ -49,13 +50,37 @@ class ConsoleOperator:
         """
         if scene == self._placed:
             return
+        self._wait(f"Put {scene!r} on the table", scene)
+        self._placed = scene
+
+    def _wait(self, wish: str, scene: str) -> None:
+        """Ask, and return when Enter was pressed."""
         ask, answer = self._ask or sys.stderr, self._answer or sys.stdin
         if self._answer is None and not answer.isatty():
             raise DeviceError(f"nobody is at the console to place {scene!r}", hint="run it in a terminal")
-        print(f"Put {scene!r} on the table, step out of the arm's reach, press Enter.", file=ask, flush=True)
+        print(f"{wish}, step out of the arm's reach, press Enter.", file=ask, flush=True)
         if not answer.readline():
             raise DeviceError(f"the console's input ended before {scene!r} was placed")
-        self._placed = scene
+
+    def turn(self, scene: str, angle: float) -> None:
+        """Ask for the scene to be turned about the vertical, and wait until it is.
+
+        Parameters
+        ----------
+        scene
+            Its name.
+        angle
+            From how it stood first, counter-clockwise seen from above, radians.
+
+        Raises
+        ------
+        DeviceError
+            Nobody can answer.
+        """
+        self._wait(
+            f"Turn {scene!r} to {math.degrees(angle):.0f} deg, counter-clockwise from how it stood first",
+            scene,
+        )
 
     def truth(self) -> Truth | None:
         """Nobody knows the real world exactly."""

@@ -72,8 +72,7 @@ def _seen(T_base_tof: Float64, board: Float64, normal: Float64, camera: Camera) 
     """Which cells of the image (9, 12) look at the board's disc."""
     v = (np.arange(CELLS[0]) + 0.5) * camera.height / CELLS[0] - 0.5
     u = (np.arange(CELLS[1]) + 0.5) * camera.width / CELLS[1] - 0.5
-    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    rays = camera.rays_at(np.stack(np.meshgrid(u, v), axis=-1))
     T_board_tof = invert(look_at(board, board + normal)) @ T_base_tof
     way, eye = rays @ T_board_tof[:3, :3].T, T_board_tof[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):

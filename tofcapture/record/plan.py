@@ -3,79 +3,52 @@
 A UR arm reaches far fewer views than one expects (a UR10e half of those 1.4 m away), so the plan offers thousands of candidates,
 keeps what is reachable and clear at the goal and on the straight way from home, and picks from them by farthest-point sampling
 over direction and distance. Sampling is greedy: the first 10 of 25 views are the 10 of a plan for 10, so a recording can be
-extended.
+extended. Where the arm sees an object from one side only, a person may turn the object: directions are then told apart as the
+object sees them.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices.kinematics import ArmModel, forward, inverse_all, wrap
-from tofcapture.poses import Float64, invert, look_at, rotate_vectors
-from tofcapture.record.clearance import REASONS, Stage, is_clear, obstacles
+from tofcapture.devices.kinematics import ArmModel, forward
+from tofcapture.poses import Float64, rotate_vectors
+from tofcapture.record.candidates import (
+    BRANCH,
+    FATES,
+    REMEDIES,
+    Bools,
+    Sampling,
+    board_sampling,
+    branches,
+    candidates,
+    flange_poses,
+    leans,
+    object_sampling,
+)
+from tofcapture.record.clearance import Stage, is_clear
 from tofcapture.rig import Rig
 
-Bools = NDArray[np.bool_]
+__all__ = [
+    "FATES",
+    "REMEDIES",
+    "Plan",
+    "PlannedView",
+    "Sampling",
+    "Tried",
+    "board_sampling",
+    "object_sampling",
+    "plan_views",
+]
 
 _LOG_DISTANCE = 0.6  # rad per e-fold of distance: how much a nearer view counts against a turned one
 _FEW = 24  # candidates that each pick of the sampling chooses among
-_BRANCH = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.25])  # weight of each joint in "close to home" and in travel
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """Where candidates lie.
-
-    Attributes
-    ----------
-    axis
-        (3,) direction from the target about which views are spread.
-    tilt
-        Smallest and largest angle to the axis, radians.
-    distances
-        From the ToF camera to the target, metres.
-    aim
-        How far from the target the camera may look, metres.
-    directions, rolls
-        How many of each are tried; of the rolls, the one nearest to home is kept.
-    lean
-        How much, in radians, it counts that the axis leans in another direction of the image; zero where rolls do not matter.
-    """
-
-    axis: Float64
-    tilt: tuple[float, float] = (0.0, float(np.radians(65.0)))
-    distances: tuple[float, ...] = (0.35, 0.43, 0.53, 0.65, 0.80, 0.98, 1.18, 1.38)
-    aim: float = 0.02
-    directions: int = 400
-    rolls: int = 4
-    lean: float = 0.0
-
-
-def object_sampling() -> Sampling:
-    """All around the vertical, 0.35 to 1.5 m."""
-    return Sampling(axis=np.array([0.0, 0.0, 1.0]))
-
-
-def board_sampling(stage: Stage) -> Sampling:
-    """Tilts of 15 to 40 deg to the board's normal in all directions, of the room and of the image, 0.5 to 1 m.
-
-    One roll for each candidate, at random: were the one nearest to home taken, the board would lean the same way in most images.
-    """
-    return Sampling(
-        stage.board_normal,
-        (float(np.radians(15.0)), float(np.radians(40.0))),
-        distances=(0.5, 0.6, 0.72, 0.85, 1.0),
-        aim=0.04,
-        directions=240,
-        rolls=1,
-        lean=0.5,
-    )
 
 
 @dataclass(frozen=True)
@@ -94,6 +67,8 @@ class PlannedView:
         From the ToF camera to the target, metres.
     direction
         (3,) unit, from the target to the camera, base frame.
+    turn
+        How far the object has been turned about the vertical by then, counter-clockwise seen from above, radians.
     """
 
     index: int
@@ -101,11 +76,29 @@ class PlannedView:
     T_base_flange: Float64
     distance: float
     direction: Float64
+    turn: float = 0.0
 
     @property
     def digest(self) -> str:
-        """Names the pose; a view of another digest is another view."""
-        return hashlib.sha256((np.round(self.joints, 6) + 0.0).tobytes()).hexdigest()[:16]
+        """Names the pose, of the arm and of the object; a view of another digest is another view."""
+        numbers = np.append(self.joints, self.turn) if self.turn else self.joints
+        return hashlib.sha256((np.round(numbers, 6) + 0.0).tobytes()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What became of the candidates.
+
+    Attributes
+    ----------
+    spots
+        (C, 3) where the ToF camera would stand, base frame, metres.
+    fates
+        (C,) int, index into :data:`FATES` of what stood against it, -1 for nothing.
+    """
+
+    spots: Float64
+    fates: NDArray[np.int8]
 
 
 @dataclass(frozen=True)
@@ -123,12 +116,15 @@ class Plan:
     refused
         Reason -> number of candidates: ``reach``; those of :data:`clearance.REASONS`; ``mixed``, no branch clear for one
         reason alone; ``way from home``, of the candidates that sampling came upon.
+    tried
+        The candidates themselves, for the picture.
     """
 
     views: tuple[PlannedView, ...]
     wanted: int
     candidates: int
     refused: dict[str, int]
+    tried: Tried | None = field(default=None, repr=False, compare=False)
 
     @property
     def digest(self) -> str:
@@ -140,6 +136,17 @@ class Plan:
         """One line: how many views, of how many candidates, and what stood against the others."""
         refused = ", ".join(f"{count} {reason}" for reason, count in self.refused.items() if count)
         return f"{len(self.views)} of {self.wanted} views; {self.candidates} candidates, refused: {refused or 'none'}"
+
+    def shortfall(self) -> list[str]:
+        """Say why there are fewer views than wanted, the commonest reason first; nothing when there are enough."""
+        if len(self.views) >= self.wanted:
+            return []
+        counts = sorted(((n, fate) for fate, n in self.refused.items() if n), reverse=True)
+        lines = [
+            f"only {len(self.views)} of {self.wanted} views can be taken, of {self.candidates} candidates"
+        ]
+        lines += [f"  {n} are {REMEDIES[fate][0]}: {REMEDIES[fate][1]}" for n, fate in counts]
+        return [*lines, "  or have the object turned between views: --turns 4"]
 
     def table(self) -> dict[str, Any]:
         """Write the plan as JSON types."""
@@ -154,6 +161,7 @@ class Plan:
                     "joints": v.joints.tolist(),
                     "distance": v.distance,
                     "direction": v.direction.tolist(),
+                    "turn_deg": round(float(np.degrees(v.turn)), 6),
                 }
                 for v in self.views
             ],
@@ -168,6 +176,7 @@ def plan_views(
     sampling: Sampling,
     views: int,
     rng: np.random.Generator,
+    turns: int = 1,
 ) -> Plan:
     """Plan the views of one scene.
 
@@ -183,107 +192,48 @@ def plan_views(
         How many are wanted.
     rng
         Turns and jitters the candidates, so that scenes differ; the same generator gives the same plan.
+    turns
+        In how many ways the object is put on the table, a full turn divided by this apart. Views of one turn are taken one after
+        the other.
 
     Returns
     -------
     Plan
         With fewer views than wanted where the arm reaches no more.
     """
-    directions, distances = _candidates(sampling, rng)
-    T_base_flange = _flange_poses(rig, target, sampling, directions, distances, rng)
-    joints, refused = _branches(model, rig, stage, T_base_flange)
-    usable: Bools = np.all(np.isfinite(joints), axis=-1)
-    features = np.column_stack([directions, _LOG_DISTANCE * np.log(distances)])
+    directions, distances = candidates(sampling, rng)
+    T_base_flange = flange_poses(rig, target, sampling, directions, distances, rng)
+    joints, fates = branches(model, rig, stage, T_base_flange)
+    count = len(joints)
+    angles = 2 * np.pi * np.arange(turns) / turns
+    seen = np.concatenate([rotate_vectors(_about_vertical(-angle), directions) for angle in angles])
+    features = np.column_stack([seen, _LOG_DISTANCE * np.log(np.tile(distances, turns))])
     if sampling.lean:
-        features = np.column_stack(
-            [features, sampling.lean * _leans(rig, sampling.axis, T_base_flange[:, 0])]
-        )
-    refused["way from home"] = 0
+        lean = sampling.lean * leans(rig, sampling.axis, T_base_flange[:, 0])
+        features = np.column_stack([features, np.tile(lean, (turns, 1))])
 
     def accept(k: int) -> bool:
-        clear = is_clear(model, rig, stage, stage.home, joints[k])
-        refused["way from home"] += not clear
+        clear = is_clear(model, rig, stage, stage.home, joints[k % count])
+        if not clear:
+            fates[k % count] = FATES.index("way from home")
         return clear
 
-    chosen = _spread(features, usable, views, accept, rng)
+    chosen = _spread(features, np.tile(fates < 0, turns), views, accept, rng)
     planned = [
-        PlannedView(i, joints[k], forward(model, joints[k]), float(distances[k]), directions[k])
-        for i, k in enumerate(chosen)
+        PlannedView(i, joints[c], forward(model, joints[c]), float(distances[c]), directions[c], angle)
+        for i, c, angle in ((i, k % count, float(angles[k // count])) for i, k in enumerate(chosen))
     ]
-    return Plan(tuple(_by_travel(planned, stage.home)), views, len(usable), refused)
+    refused = {fate: int((fates == i).sum()) for i, fate in enumerate(FATES)}
+    tried = Tried(target + distances[:, None] * directions, fates)
+    return Plan(tuple(_by_travel(planned, stage.home)), views, count, refused, tried)
 
 
-def _candidates(sampling: Sampling, rng: np.random.Generator) -> tuple[Float64, Float64]:
-    """Directions (C, 3) on a Fibonacci spiral about the axis, each at all distances (C,), jittered by up to 8 %."""
-    n = sampling.directions
-    low, high = np.cos(sampling.tilt[0]), np.cos(sampling.tilt[1])
-    cosine = low + (high - low) * (np.arange(n) + 0.5) / n
-    sine = np.sqrt(1 - cosine**2)
-    turn = np.pi * (1 + np.sqrt(5)) * np.arange(n) + rng.uniform(0, 2 * np.pi)
-    local = np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=1)
-    about_axis = look_at(np.zeros(3), sampling.axis)
-    directions = np.repeat(rotate_vectors(about_axis, local), len(sampling.distances), axis=0)
-    distances = np.tile(sampling.distances, n) * rng.uniform(1.0, 1.08, n * len(sampling.distances))
-    return directions, distances
-
-
-def _flange_poses(
-    rig: Rig,
-    target: Float64,
-    sampling: Sampling,
-    directions: Float64,
-    distances: Float64,
-    rng: np.random.Generator,
-) -> Float64:
-    """(C, rolls, 4, 4) flange poses from which the ToF camera looks at the target, one per roll."""
-    spots = target + rng.uniform(-sampling.aim, sampling.aim, directions.shape)
-    rolls = 2 * np.pi * (np.arange(sampling.rolls) / sampling.rolls) + rng.uniform(
-        0, 2 * np.pi, (len(spots), 1)
-    )
-    cameras = np.stack(
-        [look_at(spot + r * u, spot) for spot, r, u in zip(spots, distances, directions, strict=True)]
-    )
-    c, s = np.cos(rolls), np.sin(rolls)
-    turns = np.broadcast_to(np.eye(4), (*rolls.shape, 4, 4)).copy()
-    turns[..., 0, 0], turns[..., 0, 1], turns[..., 1, 0], turns[..., 1, 1] = c, -s, s, c
-    return cameras[:, None] @ turns @ invert(rig.T_flange_tof)
-
-
-def _leans(rig: Rig, axis: Float64, T_base_flange: Float64) -> Float64:
-    """Directions (C, 2), unit, in which the axis leans in the ToF image."""
-    T_base_tof = T_base_flange @ rig.T_flange_tof
-    lean = np.swapaxes(T_base_tof[:, :3, :2], 1, 2) @ axis
-    out: Float64 = lean / np.maximum(np.linalg.norm(lean, axis=1, keepdims=True), 1e-9)
-    return out
-
-
-def _branches(
-    model: ArmModel, rig: Rig, stage: Stage, T_base_flange: Float64
-) -> tuple[Float64, dict[str, int]]:
-    """(C, 6) of the clear branch and roll nearest to home, NaN where there is none; what stood in the way how often."""
-    count = len(T_base_flange)
-    q = stage.home + wrap(inverse_all(model, T_base_flange) - stage.home)
-    q = q.reshape(count, -1, 6)
-    reached: Bools = np.all(np.abs(q) <= model.limit, axis=-1)  # NaN is not
-    hits = np.zeros((*reached.shape, len(REASONS)), dtype=bool)
-    hits[reached] = obstacles(model, rig, stage, q[reached])
-    clear: Bools = reached & ~np.any(hits, axis=-1)
-    cost = np.where(clear, (_BRANCH * np.nan_to_num(q - stage.home) ** 2).sum(axis=-1), np.inf)
-    best = q[np.arange(count), cost.argmin(axis=1)]
-    lost: Bools = ~np.any(clear, axis=1)
-    # Rounded to a millionth, goals are the same on machines whose last bits differ.
-    return np.where(lost[:, None], np.nan, np.round(best, 6)), _tally(reached, hits, lost)
-
-
-def _tally(reached: Bools, hits: Bools, lost: Bools) -> dict[str, int]:
-    """Count each lost candidate under the first reason that stands against all of its branches, else under ``mixed``."""
-    out = {"reach": int((~reached.any(axis=1)).sum())}
-    left = lost & reached.any(axis=1)
-    for i, reason in enumerate(REASONS):
-        always = left & (hits[..., i] | ~reached).all(axis=1)
-        out[reason] = int(always.sum())
-        left &= ~always
-    out["mixed"] = int(left.sum())
+def _about_vertical(angle: float) -> Float64:
+    """(4, 4) turn about the base's z."""
+    out = np.eye(4)
+    out[0, 0] = out[1, 1] = np.cos(angle)
+    out[1, 0] = np.sin(angle)
+    out[0, 1] = -out[1, 0]
     return out
 
 
@@ -313,10 +263,11 @@ def _spread(
 
 
 def _by_travel(views: Sequence[PlannedView], home: Float64) -> list[PlannedView]:
-    """Order by nearest neighbour in weighted joint space, starting from home."""
+    """Order by turn of the object, then by nearest neighbour in weighted joint space, starting from home."""
     left, here, out = list(views), home, []
     while left:
-        costs = [float(np.abs(_BRANCH * (v.joints - here)).max()) for v in left]
+        turn = min(v.turn for v in left)
+        costs = [float(np.abs(BRANCH * (v.joints - here)).max()) if v.turn == turn else np.inf for v in left]
         out.append(left.pop(int(np.argmin(costs))))
         here = out[-1].joints
     return out

@@ -2,39 +2,29 @@
 
 from __future__ import annotations
 
-import platform
 import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from tofcapture import __version__
-from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.station import Station
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 from tofcapture.files.view import view_path, write_view
-from tofcapture.frames import ArmState, View
-from tofcapture.poses import Float64, invert, rotation_angle
-from tofcapture.record.clearance import route, stage_of
-from tofcapture.record.journal import Journal, hold, hold_arm, utc_now
+from tofcapture.record.journal import Journal, hold, hold_arm
 from tofcapture.record.plan import Plan, PlannedView
 from tofcapture.record.reconcile import reconcile
 from tofcapture.record.scene_plan import plan_scene
+from tofcapture.record.shot import capture, notes_of, provenance_of, worth_retaking
 from tofcapture.record.watch import DiskFull, Watch, is_full
 
 _VIEW_BYTES = 40e6  # a view of a full-size rig with truth, and room to spare
 _RESERVE_BYTES = 0.5e9
 _ATTEMPTS = 3
 _GIVE_UP = 2  # views in a row that fail before the run ends
-_MOTION = (
-    0.2e-3,
-    np.radians(0.02),
-)  # m, rad: more between the first and the last exposure, and the view is retaken
 
 Progress = Callable[[int, int], None]
 
@@ -59,6 +49,8 @@ class RecordResult:
         One sentence for each thing put right in the recording.
     plan
         The plan that was followed.
+    notes
+        One sentence for each thing about a view, taken now, that is not as it should be (``record.quality``).
     """
 
     scene: str
@@ -68,6 +60,7 @@ class RecordResult:
     reasons: tuple[str, ...]
     repaired: tuple[str, ...]
     plan: Plan
+    notes: tuple[str, ...] = ()
 
 
 def record(
@@ -78,6 +71,7 @@ def record(
     frames: int = 10,
     progress: Progress = _silent,
     watch: Watch | None = None,
+    turns: int = 1,
 ) -> RecordResult:
     """Take every missing view of one scene.
 
@@ -98,11 +92,13 @@ def record(
         Called with (views there, views planned) before the first and after each view.
     watch
         Looks on; may make the recorder wait between views, or end it.
+    turns
+        In how many ways the object is put on the table (``record.plan``); the operator is asked to turn it.
 
     Raises
     ------
     ConfigError
-        The recording was begun with other cameras, frames or poses.
+        The recording was begun with other cameras, frames or poses; or the operator cannot turn objects.
     DiskFull
         The disk is too small, or full.
     BusyError
@@ -115,7 +111,8 @@ def record(
     if frames < 1:
         raise ConfigError(f"frames: expected at least 1, got {frames}")
     watch = watch or Watch()
-    plan = plan_scene(station, scene, views)
+    plan = plan_scene(station, scene, views, turns)
+    _check_turns(station, plan)
     try:
         _begin(recording, station)
         with hold(recording), hold_arm(station.arm), closing(Journal(recording)) as journal:
@@ -128,6 +125,7 @@ def record(
             missing = [view for view in plan.views if view.index not in kept]
             taking = _Taking(station, scene, recording, frames, plan, journal, watch)
             reasons = _take_all(taking, missing, len(kept), progress)
+            notes = [f"view {i}: {note}" for i in sorted(taking.notes) for note in taking.notes[i]]
     except (OSError, RuntimeError, sqlite3.OperationalError) as err:
         if not is_full(err):
             raise
@@ -143,7 +141,17 @@ def record(
         reasons=tuple(f"view {i}: {reasons[i]}" for i in sorted(reasons)),
         repaired=tuple(repaired),
         plan=plan,
+        notes=tuple(notes),
     )
+
+
+def _check_turns(station: Station, plan: Plan) -> None:
+    """Refuse a plan with turns of the object where nobody can turn it."""
+    if any(view.turn for view in plan.views) and not hasattr(station.operator, "turn"):
+        raise ConfigError(
+            "turns: this station's operator cannot turn the object",
+            hint='a person can: [operator] driver = "console", in a terminal; or record without --turns',
+        )
 
 
 @dataclass(frozen=True)
@@ -157,6 +165,7 @@ class _Taking:
     plan: Plan
     journal: Journal
     watch: Watch
+    notes: dict[int, list[str]] = field(default_factory=dict)
 
     def begin(self, index: int, step: str) -> None:
         """Journal a step of a view, before anything is done."""
@@ -169,12 +178,16 @@ def _take_all(taking: _Taking, missing: list[PlannedView], kept: int, progress: 
     _check_space(taking.recording, len(missing))
     if missing:
         taking.station.operator.place(taking.scene)
-    total = len(taking.plan.views)
+    # How the object stands after an earlier run, nobody knows: where it is turned at all, the first view asks too.
+    total, turned = len(taking.plan.views), np.nan if any(v.turn for v in taking.plan.views) else 0.0
     reasons: dict[int, str] = {}
     for turn, planned in enumerate(missing):
         progress(kept + turn - len(reasons), total)
         taking.watch.before_view(planned.index)
         _check_space(taking.recording, 1)
+        if planned.turn != turned:
+            taking.station.operator.turn(taking.scene, planned.turn)  # type: ignore[attr-defined]
+            turned = planned.turn
         try:
             _take(taking, planned)
         except DeviceError as err:
@@ -219,7 +232,7 @@ def _check_space(recording: Path, missing: int) -> None:
 
 def _take(taking: _Taking, planned: PlannedView) -> None:
     """Take and seal one view, three attempts at most; a refused motion is refused for good."""
-    provenance = _provenance(taking.station, taking.plan, planned)
+    provenance = provenance_of(taking.station, taking.plan, planned)
     for attempt in range(1, _ATTEMPTS + 1):
         taking.journal.attempt(taking.scene, planned.index)
         try:
@@ -237,83 +250,11 @@ def _take(taking: _Taking, planned: PlannedView) -> None:
             if attempt == _ATTEMPTS:
                 raise
         else:
-            break
+            if attempt == _ATTEMPTS or not worth_retaking(view):
+                break
+    if notes := notes_of(view):
+        taking.notes[planned.index] = notes
     taking.begin(planned.index, "sealing")
     digest = write_view(view_path(taking.recording, taking.scene, planned.index), view)
     taking.journal.seal(taking.scene, planned.index, digest)
     taking.watch.sealed(view, digest)
-
-
-def _no_step(step: str) -> None:
-    del step
-
-
-def capture(
-    station: Station,
-    scene: str,
-    planned: PlannedView,
-    frames: int,
-    provenance: dict[str, Any],
-    begin: Callable[[str], None] = _no_step,
-) -> View:
-    """Go there and take one view: arm, ToF burst, stereo frame, arm again.
-
-    ToF comes first and alone: the stereo camera's projector would shine into its pixels. ``begin`` is called with the name
-    of each step ahead of it.
-
-    Raises
-    ------
-    DeviceError
-        A device fails, or the rig moved between the exposures.
-    """
-    begin("moving")
-    before = _go(station, planned)
-    begin("tof")
-    tof = station.tof.capture(frames)
-    begin("stereo")
-    stereo = station.stereo.capture()
-    after = station.arm.state()
-    _check_still(before, after)
-    truth = station.operator.truth()
-    return View(scene, planned.index, tof, stereo, before, after, station.rig, provenance, truth)
-
-
-def _go(station: Station, planned: PlannedView) -> ArmState:
-    """Move to a planned view by a clear way; the arm returns settled."""
-    model, stage = arm_model(station.arm.describe().model), stage_of(station.config)
-    state = station.arm.state()
-    for joints in route(model, station.rig, stage, state.joints, planned.joints):
-        state = station.arm.move_to(joints)
-    return state
-
-
-def _check_still(before: ArmState, after: ArmState) -> None:
-    """Refuse a view during which the rig moved."""
-    shift, turn = _moved(before.T_base_flange, after.T_base_flange)
-    if shift > _MOTION[0] or turn > _MOTION[1]:
-        raise DeviceError(
-            f"the arm moved by {shift * 1e3:.2f} mm, {np.degrees(turn):.3f} deg during the exposures",
-            hint="let it settle longer; look for vibration",
-        )
-
-
-def _moved(a: Float64, b: Float64) -> tuple[float, float]:
-    """Metres and radians between two poses."""
-    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), rotation_angle(invert(a) @ b)
-
-
-def _provenance(station: Station, plan: Plan, planned: PlannedView) -> dict[str, Any]:
-    """Everything that says how a view came about."""
-    return {
-        "tofcapture": __version__,
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "arm": station.describe()["arm"],
-        "seed": station.seed,
-        "simulated": station.simulated,
-        "plan": plan.digest,
-        "pose": planned.digest,
-        "distance": planned.distance,
-        "direction": planned.direction.tolist(),
-        "utc": utc_now(),
-    }

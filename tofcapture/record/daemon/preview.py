@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from tofcapture.frames import View
 from tofcapture.ops.phase import decode, mean_phasors
 from tofcapture.poses import Float64
+from tofcapture.record.quality import measure
 
 NAMES = ("amplitude", "depth", "stereo")
 _WIDE = 320  # px; larger pictures are thinned out
-_DARK = 40.0  # raw units; a weaker phasor is hardly a measurement
 # Polynomial approximation of the colour map turbo: red, green, blue, constant term first.
 _TURBO = np.array(
     [
@@ -104,30 +104,18 @@ def pictures(view: View) -> dict[str, bytes]:
     }
 
 
-def quality(view: View) -> dict[str, float | int | None]:
-    """Numbers about a view: shares of its pixels from 0 to 1, motion in metres, degrees Celsius.
-
-    What the recorder itself found out (``provenance["quality"]``) comes along under its own names.
-    """
-    tof, info = view.tof, view.tof.info
-    amplitude = np.abs(mean_phasors(tof.raw[:1], info.modulation_hz, info.phase_rad)).min(axis=0)
-    gaps = np.diff(np.asarray(tof.time_ns, dtype=np.int64))
-    usual = float(np.median(gaps)) if len(gaps) else 0.0
-    shift = view.arm_after.T_base_flange[:3, 3] - view.arm_before.T_base_flange[:3, 3]
-    celsius = float(np.mean(tof.celsius))
+def quality(view: View) -> dict[str, Any]:
+    """Numbers about a view: those of ``record.quality``, its notes in sentences, frames, degrees Celsius."""
+    found: Any = view.provenance.get("quality")
+    if found is None:
+        found = measure(view.tof, view.stereo, view.arm_before, view.arm_after, view.rig, len(view.tof.raw))
+    celsius = float(np.mean(view.tof.celsius))
     return {
-        "saturated": _round((tof.raw >= info.saturation).any(axis=(0, 1)).mean()),
-        "dark": _round((amplitude < _DARK).mean()),
-        "stereo_coverage": _round(np.isfinite(view.stereo.points[..., 2]).mean()),
-        "motion_m": _round(np.linalg.norm(shift), 7),
-        "frames": len(tof.time_ns),
-        "frame_drops": int(np.count_nonzero(gaps.astype(np.float64) > 1.5 * usual)) if usual > 0 else 0,
+        **{name: value for name, value in found.items() if name != "notes"},
+        "notes": [note["words"] for note in found.get("notes", ())],
+        "frames": len(view.tof.time_ns),
         "celsius": round(celsius, 1) if np.isfinite(celsius) else None,
     }
-
-
-def _round(value: Any, digits: int = 4) -> float:
-    return round(float(value), digits)
 
 
 def save(view: View, folder: Path) -> None:

@@ -94,7 +94,8 @@ function showViews() {
     const cells = [view.index, word, percent(q.saturated), percent(q.dark), percent(q.stereo_coverage), motion, q.frame_drops ?? ""];
     row.append(...cells.map((text) => Object.assign(document.createElement("td"), { textContent: text })));
     row.children[1].className = view.index === now ? "now" : view.state;
-    if (view.reason) row.title = view.reason;
+    const said = view.reason || (q.notes ?? []).join("; ");
+    if (said) row.title = said;
     return row;
   });
   $("views").replaceChildren(...rows);

@@ -1,0 +1,259 @@
+"""Quality at capture: every check fires on what it is for and on nothing else; what a retake can mend is taken again."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.test_recorder import VIEWS, Bench, _few_candidates, _record
+from tofcapture.camera import Camera
+from tofcapture.devices.console import ConsoleOperator
+from tofcapture.errors import ConfigError, DeviceError
+from tofcapture.files.view import read_view, view_path
+from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
+from tofcapture.poses import rotation_exp, transform
+from tofcapture.record.journal import Journal
+from tofcapture.record.quality import CHECKS, NOTE, REFUSE, RETAKE, judge, measure, record_of, sentence
+from tofcapture.rig import Rig
+
+__all__ = ["_few_candidates"]  # applies here too
+
+TOF, STEREO = Camera(48, 36, 40.0, 40.0, 23.5, 17.5), Camera(64, 52, 50.0, 50.0, 31.5, 25.5)
+RIG = Rig(TOF, STEREO, transform(np.eye(3), [-0.05, 0.08, 0.0]), transform(np.eye(3), [0.0, -0.035, 0.08]))
+MS = 1_000_000
+FRAMES = 5
+
+
+def _good(**change):
+    """A good view's parts: a wall 0.8 m away, noise, five frames 33 ms apart."""
+    rng = np.random.default_rng(1)
+    info = TofInfo("fake", "1", TOF, np.zeros(3))
+    phase = np.asarray(info.phase_rad)
+    clean = 600 + 200 * np.cos(1.0 + phase)[:, None, None] * np.ones((8, 36, 48))
+    raw = np.round(clean + rng.normal(0, 4, (FRAMES, *clean.shape))).astype(np.uint16)
+    u, v = np.meshgrid(np.arange(64.0), np.arange(52.0))
+    points = 0.8 * np.stack([(u - 31.5) / 50, (v - 25.5) / 50, np.ones_like(u)], axis=-1)
+    parts = {
+        "tof": TofBurst(raw, 1000 * MS + np.arange(FRAMES) * 33 * MS, np.full(FRAMES, 40.0), info),
+        "stereo": StereoFrame(points.astype(np.float32), 1300 * MS, StereoInfo("fake", "1", STEREO)),
+        "before": ArmState(np.zeros(6), np.eye(4), 990 * MS),
+        "after": ArmState(np.zeros(6), np.eye(4), 1400 * MS),
+        "rig": RIG,
+        "frames": FRAMES,
+    }
+    return {**parts, **change}
+
+
+def _raw(tof, change):
+    raw = tof.raw.copy()
+    change(raw)
+    return replace(tof, raw=raw)
+
+
+def _failing(parts):
+    return {check.name for check in judge(measure(**parts))}
+
+
+def test_a_good_view_passes():
+    """Nothing is said about a good view, and every check has a number."""
+    numbers = measure(**_good())
+    assert judge(numbers) == []
+    assert set(numbers) == {check.name for check in CHECKS}
+    assert record_of(numbers, [])["notes"] == []
+
+
+def _flash(raw):
+    raw[2, :, :20, :20] += 60
+
+
+def _set(where, value):
+    def change(raw):
+        raw[where] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        (
+            "motion_m",
+            lambda p: {"after": ArmState(np.zeros(6), transform(np.eye(3), [0, 0, 3e-4]), 2000 * MS)},
+        ),
+        (
+            "motion_deg",
+            lambda p: {
+                "after": ArmState(np.zeros(6), transform(rotation_exp([0, 0, 4e-4]), np.zeros(3)), 2000 * MS)
+            },
+        ),
+        ("missing_frames", lambda p: {"frames": FRAMES + 1}),
+        ("stale_frames", lambda p: {"tof": replace(p["tof"], time_ns=p["tof"].time_ns - 200 * MS)}),
+        ("stale_frames", lambda p: {"tof": _raw(p["tof"], lambda raw: raw.__setitem__(3, raw[2]))}),
+        ("stale_frames", lambda p: {"stereo": replace(p["stereo"], time_ns=500 * MS)}),
+        (
+            "frame_drops",
+            lambda p: {"tof": replace(p["tof"], time_ns=p["tof"].time_ns + 33 * MS * (np.arange(5) > 2))},
+        ),
+        ("flicker", lambda p: {"tof": _raw(p["tof"], _flash)}),
+        ("saturated", lambda p: {"tof": _raw(p["tof"], _set((slice(None), slice(None), slice(0, 3)), 4095))}),
+        (
+            "stereo_coverage",
+            lambda p: {"stereo": replace(p["stereo"], points=np.full_like(p["stereo"].points, np.nan))},
+        ),
+        ("overlap", lambda p: {"rig": replace(RIG, T_tof_stereo=transform(np.eye(3), [0.75, 0.0, 0.0]))}),
+    ],
+)
+def test_each_check_fires_on_what_it_is_for(name, change):
+    """One thing is wrong, and that thing alone is named."""
+    parts = _good()
+    failing = _failing({**parts, **change(parts)})
+    assert name in failing
+    assert failing <= {name, *(("overlap",) if name == "stereo_coverage" else ())}
+
+
+def test_dark_is_noted_and_unlit_is_refused():
+    """A dark object is no reason for a retake; an image without any light is no image."""
+    parts = _good()
+    rng = np.random.default_rng(2)
+    faint = np.round(600 + rng.normal(0, 4, parts["tof"].raw.shape)).astype(np.uint16)
+    some = parts["tof"].raw.copy()
+    some[..., :20, :] = faint[..., :20, :]
+    assert _failing({**parts, "tof": replace(parts["tof"], raw=some)}) == {"dark"}
+    found = judge(measure(**{**parts, "tof": replace(parts["tof"], raw=faint)}))
+    assert [check.action for check in found] == [REFUSE, NOTE]
+
+
+def test_refusals_come_first_and_speak():
+    """The gravest failure is first; each has a sentence and a remedy."""
+    numbers = {check.name: 0.0 if check.least else 1e3 for check in CHECKS}
+    failed = judge(numbers)
+    assert len(failed) == len(CHECKS)
+    order = [check.action for check in failed]
+    assert order == sorted(order, key=(REFUSE, RETAKE, NOTE).index)
+    assert all(sentence(check, numbers) and check.hint for check in failed)
+
+
+class Lamp(Bench):
+    """A bench whose ToF burst has a dropped frame in the first ``bad`` bursts."""
+
+    def __init__(self, bad):
+        super().__init__()
+        self.bad = bad
+
+    def station(self):
+        station = super().station()
+        real = station.tof.capture
+
+        def capture(frames):
+            burst = real(frames)
+            self.bad -= 1
+            times = np.arange(frames) * 33 * MS + np.where(
+                np.arange(frames) > 2, 33 * MS * (self.bad >= 0), 0
+            )
+            steady = np.repeat(burst.raw[:1] // 2, frames, axis=0)
+            steady[:, 0, 0, 0] = np.arange(frames)
+            return replace(burst, raw=steady, time_ns=times)
+
+        station.tof.capture = capture
+        return station
+
+
+@pytest.mark.parametrize(("bad", "attempts", "noted"), [(1, 2, 0), (3, 3, 1)])
+def test_dropped_frames_are_retaken_then_noted(tmp_path, bad, attempts, noted):
+    """A dropped frame is taken again; the third time the view is kept, with a note in its file and in the result."""
+    result = _record(tmp_path, Lamp(bad), views=1, frames=6)
+    assert result.recorded == (0,)
+    assert all(note.startswith("view 0: ") for note in result.notes)
+    assert sum("dropped" in note for note in result.notes) == noted
+    journal = Journal(tmp_path)
+    assert [row.attempts for row in journal.rows()] == [attempts]
+    journal.close()
+    quality = read_view(view_path(tmp_path, "mug", 0)).provenance["quality"]
+    assert sum(note["check"] == "frame_drops" for note in quality["notes"]) == noted
+    assert quality["frame_drops"] == noted
+
+
+def test_an_empty_point_map_is_never_sealed(tmp_path):
+    """Without one stereo point a view is given up after three attempts, with its reason."""
+    bench = Bench()
+    station = bench.station()
+    real, count = station.stereo.capture, iter(range(3))
+
+    def capture():
+        frame = real()
+        return (
+            replace(frame, points=np.full_like(frame.points, np.nan))
+            if next(count, None) is not None
+            else frame
+        )
+
+    station.stereo.capture = capture
+    bench.station = lambda: station
+    result = _record(tmp_path, bench)
+    assert len(result.failed) == 1
+    assert "0.0% of its image" in result.reasons[0]
+    assert len(result.recorded) == VIEWS - 1
+
+
+def test_quality_is_in_every_file(tmp_path):
+    """The numbers are in the view files as JSON types."""
+    _record(tmp_path)
+    for i in range(VIEWS):
+        quality = read_view(view_path(tmp_path, "mug", i)).provenance["quality"]
+        assert {"saturated", "dark", "overlap", "motion_m", "frame_drops", "notes"} <= quality.keys()
+
+
+class Turner(Bench):
+    """A bench whose operator turns the object."""
+
+    def station(self):
+        station = super().station()
+        station.operator.turn = lambda scene, angle: self._step(f"turn {round(np.degrees(angle))}")
+        return station
+
+
+def test_turns_are_asked_for_once_each(tmp_path):
+    """Views of one turn are taken together; each turn is asked for once, the first too; a resumed run asks again."""
+    bench = Turner()
+    _record(tmp_path, bench, views=8, turns=3)
+    asked = [step for step in bench.steps if step.startswith("turn")]
+    assert asked == ["turn 0", "turn 120", "turn 240"]
+    angles = {read_view(view_path(tmp_path, "mug", i)).provenance["turn_deg"] for i in range(8)}
+    assert angles == {0.0, 120.0, 240.0}
+    again = Turner()
+    assert _record(tmp_path, again, views=8, turns=3).kept == tuple(range(8))
+    assert again.steps == []
+    with pytest.raises(ConfigError, match="view"):
+        _record(tmp_path, Bench(), views=8)
+
+
+def test_a_person_at_the_console_turns_it():
+    """The console asks for the angle in degrees and waits; when nobody can answer it says so."""
+    asked = io.StringIO()
+    operator = ConsoleOperator({}, None, asked, io.StringIO("\n\n"))
+    operator.place("mug")
+    operator.turn("mug", np.pi / 2)
+    assert "Turn 'mug' to 90 deg" in asked.getvalue()
+    with pytest.raises(DeviceError, match="ended"):
+        operator.turn("mug", np.pi)
+
+
+def test_nobody_can_turn_it(tmp_path):
+    """Turns are refused before anything moves where the operator cannot turn objects, and for the board."""
+    bench = Bench()
+    with pytest.raises(ConfigError, match="cannot turn"):
+        _record(tmp_path, bench, views=8, turns=3)
+    with pytest.raises(ConfigError, match="the board stays"):
+        _record(tmp_path, bench, scene="calibration", turns=2)
+    assert bench.steps == []
+
+
+def test_a_burst_of_one_frame():
+    """One frame has no gaps and nothing to flicker against; the rest is looked at."""
+    parts = _good()
+    tof = parts["tof"]
+    one = replace(tof, raw=tof.raw[:1], time_ns=tof.time_ns[:1], celsius=tof.celsius[:1])
+    numbers = measure(**{**parts, "tof": one, "frames": 1})
+    assert judge(numbers) == []
+    assert set(numbers) == {check.name for check in CHECKS} - {"flicker"}

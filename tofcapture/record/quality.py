@@ -1,0 +1,257 @@
+"""Is a view any good? Looked at while the rig still stands there, so that what another try can mend is taken again.
+
+Every check is one number and a limit (:data:`CHECKS`). What is done about it depends on what a second try can do:
+
+``note``
+    A second try would show the same (a dark object, a mirror, a pose from which the cameras see different things): the view is
+    kept, and the note goes into its file.
+``retake``
+    A disturbance that may have passed (a lamp, a passing hand, a lost frame): taken again, three times in all, then kept with the note.
+``refuse``
+    The data are not of this pose, or not there: taken again, three times in all, then the view is given up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.frames import ArmState, StereoFrame, TofBurst
+from tofcapture.ops.phase import mean_phasors
+from tofcapture.poses import Float64, invert, rotation_angle, transform_points
+from tofcapture.rig import Rig
+
+NOTE, RETAKE, REFUSE = "note", "retake", "refuse"
+
+DARK = 10.0  # raw units; the mean of ten frames knows the range of such a pixel to some 20 mm
+_CELLS = (18, 24)  # of the ToF image, in which overlap is counted
+_COLUMNS = 320  # of the stereo grid are enough for that
+_BLOCK = 20  # px; side of the blocks whose means are compared between frames
+_CLOCKS = 50_000_000  # ns; how far a device's idea of the host's clock may be off
+_FAINT = 50.0  # raw units; changes of fainter blocks are told in parts of this
+
+
+@dataclass(frozen=True)
+class Check:
+    """A number of a view, and what it must not exceed.
+
+    Attributes
+    ----------
+    name
+        Key of the number, in the file too.
+    limit
+        Largest good value; smallest where ``least``.
+    action
+        ``note``, ``retake`` or ``refuse``.
+    words
+        What is wrong, with the number as ``{0}``.
+    hint
+        What to do about it.
+    least
+        The number must not be smaller, instead of larger.
+    """
+
+    name: str
+    limit: float
+    action: str
+    words: str
+    hint: str
+    least: bool = False
+
+    def fails(self, value: float) -> bool:
+        """Tell whether a number is on the wrong side; one that could not be found is not."""
+        return value < self.limit if self.least else value > self.limit
+
+
+CHECKS = (
+    Check(
+        "motion_m",
+        0.2e-3,
+        REFUSE,
+        "the arm moved by {0:.2g} m during the exposures",
+        "let it settle longer; look for vibration",
+    ),
+    Check(
+        "motion_deg",
+        0.02,
+        REFUSE,
+        "the arm moved by {0:.2g} deg during the exposures",
+        "let it settle longer; look for vibration",
+    ),
+    Check(
+        "missing_frames",
+        0,
+        REFUSE,
+        "{0:.0f} frames of the burst are missing",
+        "look at the link and the load of this machine",
+    ),
+    Check(
+        "stale_frames",
+        0,
+        REFUSE,
+        "{0:.0f} frames are older than the pose, out of order or repeated",
+        "the camera hands out old buffers: open the station anew",
+    ),
+    Check(
+        "unlit",
+        0.98,
+        REFUSE,
+        "{0:.0%} of the ToF image got no light back",
+        "is the illumination on, the lens cap off?",
+    ),
+    Check(
+        "stereo_coverage",
+        0.02,
+        REFUSE,
+        "the stereo camera measured {0:.1%} of its image",
+        "is its projector on, and the scene within its range?",
+        least=True,
+    ),
+    Check(
+        "frame_drops",
+        0,
+        RETAKE,
+        "{0:.0f} frames were dropped within the burst",
+        "look at the link and the load of this machine",
+    ),
+    Check(
+        "flicker",
+        0.03,
+        RETAKE,
+        "the light changed by {0:.1%} between the frames",
+        "keep people and lamps out of sight; shade the sun",
+    ),
+    Check(
+        "saturated",
+        0.05,
+        NOTE,
+        "{0:.0%} of the ToF pixels are saturated",
+        "shorten the exposure; dull what shines",
+    ),
+    Check(
+        "dark",
+        0.5,
+        NOTE,
+        "{0:.0%} of the ToF pixels are too dark for 20 mm",
+        "lengthen the exposure, come nearer, or leave such objects out",
+    ),
+    Check(
+        "overlap",
+        0.3,
+        NOTE,
+        "the stereo camera covers {0:.0%} of the ToF image",
+        "is the rig right, and the distance within the stereo camera's range?",
+        least=True,
+    ),
+)
+
+
+def measure(
+    tof: TofBurst, stereo: StereoFrame, before: ArmState, after: ArmState, rig: Rig, frames: int
+) -> dict[str, float]:
+    """Find the numbers of a view.
+
+    Parameters
+    ----------
+    tof, stereo
+        What the cameras handed over.
+    before, after
+        Arm before the first and after the last exposure.
+    rig
+        As known: overlap is counted with it.
+    frames
+        ToF frames that were asked for.
+
+    Returns
+    -------
+    One number for each of :data:`CHECKS`, by name; ``flicker`` only of three frames or more.
+    """
+    info = tof.info
+    amplitude = np.abs(mean_phasors(tof.raw, info.modulation_hz, info.phase_rad)).min(axis=0)
+    shift, turn = moved(before.T_base_flange, after.T_base_flange)
+    dark = float((amplitude < DARK).mean())
+    times = np.asarray(tof.time_ns, dtype=np.int64)
+    found = {
+        "motion_m": shift,
+        "motion_deg": float(np.degrees(turn)),
+        "missing_frames": float(max(frames - len(tof.raw), 0)),
+        "stale_frames": float(_stale(tof, before.time_ns) + (stereo.time_ns < before.time_ns - _CLOCKS)),
+        "frame_drops": float(_drops(times)),
+        "saturated": float((tof.raw >= info.saturation).any(axis=(0, 1)).mean()),
+        "dark": dark,
+        "unlit": dark,
+        "stereo_coverage": float(np.isfinite(stereo.points[..., 2]).mean()),
+        "overlap": _overlap(stereo, rig),
+    }
+    if len(tof.raw) >= 3:
+        found["flicker"] = _flicker(tof.raw)
+    return {name: round(value, 7) for name, value in found.items()}
+
+
+def judge(numbers: dict[str, float]) -> list[Check]:
+    """Say which checks fail, the gravest first."""
+    failed = [c for c in CHECKS if c.name in numbers and c.fails(numbers[c.name])]
+    return sorted(failed, key=lambda c: (REFUSE, RETAKE, NOTE).index(c.action))
+
+
+def sentence(check: Check, numbers: dict[str, float]) -> str:
+    """What a failed check has to say."""
+    return check.words.format(numbers[check.name])
+
+
+def record_of(numbers: dict[str, float], failed: list[Check]) -> dict[str, Any]:
+    """What goes into the view's file: the numbers, and a sentence and the action of each check that failed."""
+    notes = [{"check": c.name, "action": c.action, "words": sentence(c, numbers)} for c in failed]
+    return {**numbers, "notes": notes}
+
+
+def moved(a: Float64, b: Float64) -> tuple[float, float]:
+    """Metres and radians between two poses (4, 4)."""
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), rotation_angle(invert(a) @ b)
+
+
+def _stale(tof: TofBurst, since: int) -> int:
+    """Count frames that were exposed before the arm stood still, go back in time, or are the one before once more."""
+    times = np.asarray(tof.time_ns, dtype=np.int64)
+    old = times < since - _CLOCKS
+    old[1:] |= np.diff(times) <= 0
+    if np.issubdtype(tof.raw.dtype, np.integer):
+        # Noise never repeats; only an ideal simulated sensor has none, and its raw is no integer.
+        old[1:] |= (tof.raw[1:] == tof.raw[:-1]).all(axis=(1, 2, 3))
+    return int(old.sum())
+
+
+def _drops(times: NDArray[np.int64]) -> int:
+    """Frames missing within a burst: what its gaps are longer than the usual one."""
+    gaps = np.diff(times).astype(np.float64)
+    usual = float(np.median(gaps)) if len(gaps) else 0.0
+    return int(np.maximum(np.round(gaps / usual) - 1, 0).sum()) if usual > 0 else 0
+
+
+def _overlap(stereo: StereoFrame, rig: Rig) -> float:
+    """Share of the ToF image's cells into which a stereo point falls."""
+    camera = rig.tof
+    step = max(1, stereo.points.shape[1] // _COLUMNS)
+    points = stereo.points[::step, ::step].reshape(-1, 3).astype(np.float64)
+    points = transform_points(rig.T_tof_stereo, points[np.isfinite(points).all(axis=1)])
+    points = points[points[:, 2] > 0]
+    u = camera.fx * points[:, 0] / points[:, 2] + camera.cx
+    v = camera.fy * points[:, 1] / points[:, 2] + camera.cy
+    cells = (min(_CELLS[0], camera.height), min(_CELLS[1], camera.width))
+    edges = ((-0.5, camera.height - 0.5), (-0.5, camera.width - 0.5))
+    hit = np.histogram2d(v, u, bins=cells, range=edges)[0]
+    return float((hit > 0).mean())
+
+
+def _flicker(raw: NDArray[Any]) -> float:
+    """Largest change of a block's mean from the median frame, as a share of it."""
+    F, K, H, W = raw.shape
+    rows, columns = max(1, H // _BLOCK), max(1, W // _BLOCK)
+    h, w = H // rows, W // columns
+    cut = raw[:, :, : rows * h, : columns * w].reshape(F, K, rows, h, columns, w)
+    means = cut.mean(axis=(1, 3, 5), dtype=np.float64)
+    usual = np.median(means, axis=0)
+    return float((np.abs(means - usual) / np.maximum(usual, _FAINT)).max())
