@@ -66,7 +66,7 @@ def lit_rims(phasor: NDArray[np.complex128], depth: Float64, camera: Camera, ill
         at = front + 0.5 + share
         along = at if sign > 0 else d.shape[-1] - 1 - at
         u, v = (along, row) if axis == 1 else (row, along)
-        ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(row))], -1)
+        ray = camera.rays_at(np.stack([u, v], axis=-1))
         slope = (inverse[:, -1] - inverse[:, 0]) / (REACH - 1)
         reach = at - front + (REACH - 1) / 2
         found.append((ray / (inverse.mean(axis=1) + slope * reach)[:, None], outward(axis, sign, len(row))))

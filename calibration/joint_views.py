@@ -153,10 +153,7 @@ def halo_errors(phasor: NDArray[np.complex128], modulation_hz: tuple[float, ...]
 
 def _pixels_of(points: Float64, camera: Camera) -> NDArray[np.intp]:
     """Flat indices of the pixels that points (N, 3) were measured in."""
-    u, v = (
-        camera.fx * points[:, 0] / points[:, 2] + camera.cx,
-        camera.fy * points[:, 1] / points[:, 2] + camera.cy,
-    )
+    u, v = camera.project(points)[0].T
     return np.asarray(np.rint(v).astype(np.intp) * camera.width + np.rint(u).astype(np.intp))
 
 

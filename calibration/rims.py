@@ -65,9 +65,7 @@ def tof_rims(phasor: NDArray[np.complex128], depth: Float64, camera: Camera) -> 
         at = front + 0.5 + w
         along = at if sign > 0 else d.shape[-1] - 1 - at
         uv = (along, row) if axis == 1 else (row, along)
-        ray = np.stack(
-            [(uv[0] - camera.cx) / camera.fx, (uv[1] - camera.cy) / camera.fy, np.ones(len(row))], -1
-        )
+        ray = camera.rays_at(np.stack(uv, axis=-1))
         slope = (inverse[:, -1] - inverse[:, 0]) / (REACH - 1)
         reach = at - front + (REACH - 1) / 2
         found.append((ray / (inverse.mean(axis=1) + slope * reach)[:, None], outward(axis, sign, len(row))))

@@ -17,6 +17,7 @@ from calibration.projective.edges import match_edges, stereo_edges, tof_edges
 from calibration.projective.grid import surface_grid
 from calibration.projective.newton import Match, moved, newton_step, normal_equations, tukey
 from calibration.projective.organised import OrganisedCloud
+from calibration.projective.weak import along_weak_motions, weak_motions
 from calibration.projective_icp import range_sigma_of, register_projective
 from calibration.registration import MIN_POINTS, Refusal, check_registration
 from tofcapture import poses
@@ -321,6 +322,70 @@ def test_backend_takes_the_image_of_an_organised_cloud():
     rotation, translation = errors(result.T_target_source)
     assert rotation < 0.1
     assert translation < 0.6
+
+
+def outline(step=0.002):
+    """Edge of the square plate and its outward normals in the plate's plane, ToF frame."""
+    s = np.arange(-0.15, 0.15, step)
+    one = np.full(len(s), 0.15)
+    sides = [(s, one, 0, 1), (s, -one, 0, -1), (one, s, 1, 0), (-one, s, -1, 0)]
+    back = np.array([[0.96, 0.28], [-0.28, 0.96]])
+    points = np.concatenate([np.column_stack([x, y]) @ back for x, y, _, _ in sides])
+    normals = np.concatenate([np.tile([a, b] @ back, (len(s), 1)) for _, _, a, b in sides])
+    flat = np.zeros((len(points), 1))
+    return np.hstack([points, flat + 0.8]), np.hstack([normals, flat])
+
+
+def test_rims_tell_an_offset_of_the_ranges():
+    """Ranges that are all 6 mm too long move a plate with rims by less than 0.5 mm where there is the stereo image, else by millimetres."""
+    depth = plates(STEREO, poses.invert(TRUE))[..., 2]
+    edge, normals = outline()
+    front = plates(TOF, np.eye(4)).reshape(-1, 3)
+    front = front[front[:, 2] < 0.9]
+    front *= 1 + 0.006 / np.linalg.norm(front, axis=1, keepdims=True)
+    source = np.concatenate([np.repeat(edge, 40, axis=0), front])
+    rim = poses.transform_points(TRUE, edge)
+    across = np.cross(np.cross(normals, edge), edge)
+    across = poses.rotate_vectors(TRUE, across / np.linalg.norm(across, axis=1, keepdims=True))
+    plate = STEREO.unproject(depth)[::4, ::4].reshape(-1, 3)
+    plane = poses.rotate_vectors(TRUE, np.tile([0.0, 0.0, -1.0], (len(plate), 1)))
+    points, n = np.concatenate([rim, plate]), np.concatenate([across, plane])
+    told = register("projective", source, OrganisedCloud(points, n, depth, STEREO), TRUE)
+    untold = register("projective", source, Cloud(points, n), TRUE)
+    assert errors(told.T_target_source)[1] < 0.5
+    assert errors(untold.T_target_source)[1] > 2
+    assert told.rmse < untold.rmse
+
+
+def test_weak_motions_are_named():
+    """Normals that all but agree leave the two slides along their plane weak, and a ball's worth of others none."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.3, 0.3, (3, 400))
+    points[2] *= 0.1
+    normals = np.tile([[0.0], [0.0], [1.0]], 400) + rng.normal(0, 0.03, (3, 400))
+
+    def ways(normals):
+        n = normals / np.linalg.norm(normals, axis=0)
+        match = Match(np.arange(400), points, n, np.zeros(400), np.ones(400), np.ones(400))
+        return weak_motions(normal_equations(match, np.ones(400), np.zeros(3))[0], 0.25)
+
+    assert len(ways(normals)) == 2
+    assert all(np.abs(way[2]) < 0.1 for way in ways(normals))
+    assert ways(rng.normal(size=(3, 400))) == []
+
+
+def test_walk_ends_where_most_rays_are_explained():
+    """Of the places along a motion the one is kept whose rays lie nearest, wherever the pose rested before."""
+    way = np.array([1.0, 0, 0, 0, 0, 0])
+
+    def refine(T):
+        off = np.full(1000, T[0, 3] - 0.0101)
+        return T, Match(
+            np.arange(1000), *np.zeros((2, 3, 1000)), off, np.full(1000, 1e-6), np.ones(1000), 1000
+        )
+
+    T = along_weak_motions(np.eye(4), [way], np.zeros(3), refine, 4.685)
+    assert T[0, 3] == pytest.approx(0.010)
 
 
 def test_few_points_are_refused_as_empty():

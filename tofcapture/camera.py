@@ -1,12 +1,15 @@
-"""Pinhole cameras: intrinsics, project and unproject, depth and radial.
+"""Cameras: intrinsics and lens, project and unproject, depth and radial.
 
+A lens is OpenCV's model: (X, Y, Z) has x = X/Z, y = Y/Z, r^2 = x^2 + y^2 and is seen at ``x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) +
+2 p1 x y + p2 (r^2 + 2 x^2)``, ``y' = y (...) + p1 (r^2 + 2 y^2) + 2 p2 x y``, ``u = fx x' + cx``, ``v = fy y' + cy``.
 Camera frames have x right, y down, z forward. Pixel centres are integers, so the image spans
 ``[-0.5, W - 0.5] x [-0.5, H - 0.5]``. ``depth`` is z, ``radial`` is the distance along the ray; both in metres.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,10 +19,86 @@ from tofcapture.errors import ConfigError
 
 Float64 = NDArray[np.float64]
 
+_NEWTON_STEPS = 30
+_INVERTED = 1e-9  # of an image coordinate at z = 1
+
+
+def distorted(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> Float64:
+    """OpenCV's distortion (k1, k2, p1, p2, k3) of coordinates (..., 2) at z = 1."""
+    k1, k2, p1, p2, k3 = coefficients
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def distortion_jacobian(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> Float64:
+    """Derivative (..., 2, 2) of :func:`distorted`."""
+    k1, k2, p1, p2, k3 = coefficients
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
+    xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    both = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    return np.stack([np.stack([xx, both], axis=-1), np.stack([both, yy], axis=-1)], axis=-2)
+
+
+def undistorted(goal: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> Float64:
+    """Inverse of :func:`distorted` by Newton's method, to 1e-9; NaN stays NaN.
+
+    Raises
+    ------
+    ConfigError
+        When the lens folds before it reaches a coordinate: it was fitted on a smaller part of the image.
+    """
+    xy = np.array(goal, dtype=np.float64)
+    for _ in range(_NEWTON_STEPS):
+        off = distorted(xy, coefficients) - goal
+        if np.nanmax(np.abs(off), initial=0.0) < 1e-14:
+            break
+        J = distortion_jacobian(xy, coefficients)
+        det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = (
+                np.stack(
+                    [
+                        J[..., 1, 1] * off[..., 0] - J[..., 0, 1] * off[..., 1],
+                        J[..., 0, 0] * off[..., 1] - J[..., 1, 0] * off[..., 0],
+                    ],
+                    axis=-1,
+                )
+                / det[..., None]
+            )
+        xy = xy - np.clip(np.nan_to_num(step, nan=0.0), -1, 1)
+    xy = np.where(np.isnan(goal), np.nan, xy)
+    missed = np.nanmax(np.abs(distorted(xy, coefficients) - goal), initial=0.0) > _INVERTED
+    if missed or _folds(xy, coefficients):
+        raise ConfigError(
+            f"lens: the distortion {[float(f'{c:.4g}') for c in coefficients]} folds inside the image and cannot be inverted",
+            hint="targets must have covered the corners of the image; fit with fewer coefficients, or set distortion to none",
+        )
+    return xy
+
+
+def _folds(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> bool:
+    """Whether the image turns over anywhere on the straight way from the axis to the coordinates."""
+    for share in (0.25, 0.5, 0.75, 1.0):
+        J = distortion_jacobian(share * xy, coefficients)
+        if (J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0] <= 0).any():
+            return True
+    return False
+
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics of a pinhole camera.
+    """Intrinsics of a camera.
 
     Attributes
     ----------
@@ -29,6 +108,8 @@ class Camera:
         Focal lengths in pixels.
     cx, cy
         Principal point in pixels, pixel centres at integers.
+    distortion
+        OpenCV's k1, k2, p1, p2, k3; empty for a pinhole or a rectified image.
     """
 
     width: int
@@ -37,12 +118,21 @@ class Camera:
     fy: float
     cx: float
     cy: float
+    distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if self.width <= 0 or self.height <= 0:
             raise ConfigError(f"camera: expected a positive image size, got {self.width} x {self.height}")
         if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
             raise ConfigError(f"camera: expected positive focal lengths, got fx {self.fx}, fy {self.fy}")
+        object.__setattr__(self, "distortion", tuple(float(k) for k in self.distortion))
+        if len(self.distortion) not in {0, 5} or not np.isfinite(self.distortion).all():
+            raise ConfigError(
+                f"camera: expected distortion k1, k2, p1, p2, k3 or none, got {list(self.distortion)}",
+                hint="append zeros to four coefficients; OpenCV's models of eight and more are not known",
+            )
+        if not any(self.distortion):
+            object.__setattr__(self, "distortion", ())
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -51,7 +141,8 @@ class Camera:
 
     def scaled(self, s: int) -> Camera:
         """Intrinsics of the same view at ``s`` times the resolution: ``f' = s f``, ``c' = s (c + 0.5) - 0.5``."""
-        return Camera(
+        return replace(
+            self,
             width=self.width * s,
             height=self.height * s,
             fx=self.fx * s,
@@ -60,11 +151,46 @@ class Camera:
             cy=s * (self.cy + 0.5) - 0.5,
         )
 
+    def pinhole(self, where: str) -> Camera:
+        """Return the camera itself; what assumes straight projection asks for it.
+
+        Raises
+        ------
+        ConfigError
+            When the camera has distortion.
+        """
+        if self.distortion:
+            raise ConfigError(
+                f"{where}: expected an image without distortion, got k1 {self.distortion[0]:.4g} and more",
+                hint="rectify the image (cv2.undistort) and give the rectified intrinsics",
+            )
+        return self
+
+    def rays_at(self, pixels: NDArray[np.floating]) -> Float64:
+        """Rays (..., 3) with z = 1 through pixel coordinates (..., 2); NaN stays NaN."""
+        xy = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+        xy = undistorted(xy, self.distortion) if self.distortion else xy
+        return np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+
+    @cached_property
+    def _reach(self) -> float:
+        """Square of the radius at z = 1 at which the lens folds: nothing beyond is in the image."""
+        if not self.distortion:
+            return np.inf
+        k1, k2, _, _, k3 = self.distortion
+        # In 1 / r^2 the polynomial keeps its degree however small the coefficients are.
+        roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+        real = roots[np.isreal(roots) & (roots.real > 1e-9)].real
+        return float(1 / real.max()) if len(real) else np.inf
+
     @cached_property
     def rays(self) -> Float64:
         """(H, W, 3) rays through the pixel centres with z = 1; multiplied by depth they are points."""
         v, u = np.mgrid[0 : self.height, 0 : self.width].astype(np.float64)
-        out = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones_like(u)], axis=-1)
+        if self.distortion:
+            out = self.rays_at(np.stack([u, v], axis=-1))
+        else:
+            out = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones_like(u)], axis=-1)
         out.flags.writeable = False
         return out
 
@@ -92,16 +218,24 @@ class Camera:
         Returns
         -------
         pixels
-            (..., 2) as (u, v); NaN at or behind the camera plane.
+            (..., 2) as (u, v); NaN at or behind the camera plane, and beyond the angle at which a distorted image folds.
         depth
             (...,), metres.
         """
         z: Float64 = np.asarray(points, dtype=np.float64)[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             safe = np.where(z > 0, z, np.nan)
+            if self.distortion:
+                return self._through_lens(points[..., :2] / safe[..., None]), z
             u = self.fx * points[..., 0] / safe + self.cx
             v = self.fy * points[..., 1] / safe + self.cy
         return np.stack([u, v], axis=-1), z
+
+    def _through_lens(self, xy: Float64) -> Float64:
+        near = np.square(xy).sum(axis=-1) < self._reach
+        xy = np.where(near[..., None], xy, np.nan)
+        out: Float64 = distorted(xy, self.distortion) * [self.fx, self.fy] + [self.cx, self.cy]
+        return out
 
     def depth_to_radial(self, depth: NDArray[np.floating]) -> Float64:
         """Distance along the ray of a depth image (..., H, W)."""

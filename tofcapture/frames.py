@@ -86,6 +86,9 @@ class StereoInfo:
     serial: str
     camera: Camera
 
+    def __post_init__(self) -> None:
+        self.camera.pinhole("stereo camera (a point map's grid is rectified)")
+
 
 @dataclass(frozen=True)
 class StereoFrame:

@@ -25,8 +25,9 @@ SPEED_OF_LIGHT = 299_792_458.0  # m/s, exact
 class RangeError:
     """Systematic range error of one modulation frequency: what the sensor measures too long.
 
-    ``error = offset + scale r + sum_m (a_m cos m phi + b_m sin m phi) + per_pixel_radius * px + per_kelvin * (T - T_ref)``
-    with r the range in metres, phi = 4 pi f r / c, px the pixel's distance to the principal point (docs: method 0.4).
+    ``error = offset + scale r + sum_m (a_m cos m phi + b_m sin m phi) + per_pixel_radius * px + sum_ij c_ij x^i y^j +
+    per_kelvin * (T - T_ref) + per_inverse_amplitude / A`` with r the range in metres, phi = 4 pi f r / c, px the pixel's distance
+    to the principal point, x and y the pixel's place from -1 to 1 across the image, A the amplitude (docs: method 0.4).
 
     Attributes
     ----------
@@ -42,6 +43,10 @@ class RangeError:
         Metres per pixel of distance to the principal point.
     per_kelvin
         Metres per kelvin away from ``reference_celsius``.
+    image
+        ``(i, j, c_ij)``: powers of x and y, and metres; what a pixel measures too long for its place in the image.
+    per_inverse_amplitude
+        Metres times raw units of amplitude: what dark surfaces are measured too far.
     """
 
     modulation_hz: float
@@ -51,9 +56,16 @@ class RangeError:
     per_pixel_radius: float = 0.0
     per_kelvin: float = 0.0
     reference_celsius: float = 45.0
+    image: tuple[tuple[int, int, float], ...] = ()
+    per_inverse_amplitude: float = 0.0
 
     def at(
-        self, phase: NDArray[np.floating], radius_px: NDArray[np.floating] | float, celsius: float
+        self,
+        phase: NDArray[np.floating],
+        radius_px: NDArray[np.floating] | float,
+        celsius: float,
+        place: NDArray[np.floating] | None = None,
+        amplitude: NDArray[np.floating] | None = None,
     ) -> Float64:
         """Error in metres.
 
@@ -65,14 +77,56 @@ class RangeError:
             Broadcastable to ``phase``: distance to the principal point in pixels.
         celsius
             Sensor temperature.
+        place
+            (..., 2) x and y of :func:`image_places`; needed where there are ``image`` terms.
+        amplitude
+            Raw units, broadcastable to ``phase``; needed where there is ``per_inverse_amplitude``.
+
+        Raises
+        ------
+        ConfigError
+            When a term lacks what it depends on.
         """
         phase = np.asarray(phase, dtype=np.float64)
         r = phase * SPEED_OF_LIGHT / (4 * np.pi * self.modulation_hz)
         error = self.offset + self.scale * r + self.per_kelvin * (celsius - self.reference_celsius)
         for m, a, b in self.harmonics:
             error = error + a * np.cos(m * phase) + b * np.sin(m * phase)
-        out: Float64 = error + self.per_pixel_radius * np.asarray(radius_px, dtype=np.float64)
+        error = error + self.per_pixel_radius * np.asarray(radius_px, dtype=np.float64)
+        out: Float64 = error + self._of_place(place) + self._of_amplitude(amplitude)
         return out
+
+    def pixels(self, camera: Camera) -> Float64:
+        """(H, W) metres: the part that depends on the pixel alone, offset included."""
+        v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+        radius = np.hypot(u - camera.cx, v - camera.cy)
+        out: Float64 = self.offset + self.per_pixel_radius * radius + self._of_place(image_places(camera))
+        return out
+
+    def _of_place(self, place: NDArray[np.floating] | None) -> Float64 | float:
+        if not self.image:
+            return 0.0
+        if place is None:
+            raise ConfigError(
+                "range error: terms over the image need the pixel's place", hint="see image_places"
+            )
+        x, y = place[..., 0], place[..., 1]
+        return np.asarray(sum(c * x**i * y**j for i, j, c in self.image), dtype=np.float64)
+
+    def _of_amplitude(self, amplitude: NDArray[np.floating] | None) -> Float64 | float:
+        if not self.per_inverse_amplitude:
+            return 0.0
+        if amplitude is None:
+            raise ConfigError("range error: the term of dark surfaces needs amplitudes")
+        A = np.asarray(amplitude, dtype=np.float64)
+        return np.divide(self.per_inverse_amplitude, A, out=np.zeros_like(A), where=A > 0)
+
+
+def image_places(camera: Camera) -> Float64:
+    """(H, W, 2) x and y of every pixel, -1 to 1 from the first pixel's centre to the last one's."""
+    x, y = (np.linspace(-1, 1, n) if n > 1 else np.zeros(1) for n in (camera.width, camera.height))
+    out: Float64 = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1)
+    return out
 
 
 @dataclass(frozen=True)
@@ -101,6 +155,7 @@ class Rig:
     range_errors: tuple[RangeError, ...] = ()
 
     def __post_init__(self) -> None:
+        self.stereo.pinhole("rig.stereo (a point map's grid is rectified)")
         check_transform(self.T_tof_stereo, "rig.T_tof_stereo")
         check_transform(self.T_flange_tof, "rig.T_flange_tof")
 
@@ -115,28 +170,31 @@ class Rig:
         return self.T_flange_tof @ self.T_tof_stereo
 
 
-def _camera_from(table: Mapping[str, Any], where: str) -> Camera:
+def camera_from(table: Mapping[str, Any], where: str) -> Camera:
+    """Read a camera's table; :class:`ConfigError` names what is missing."""
     known = {"width", "height", "fx", "fy", "cx", "cy"}
     missing = known - table.keys()
     if missing:
         raise ConfigError(f"{where}: missing {', '.join(sorted(missing))}")
-    return Camera(
-        int(table["width"]), int(table["height"]), *(float(table[k]) for k in ("fx", "fy", "cx", "cy"))
-    )
+    fx, fy, cx, cy = (float(table[k]) for k in ("fx", "fy", "cx", "cy"))
+    distortion = tuple(float(k) for k in table.get("distortion", ()))
+    return Camera(int(table["width"]), int(table["height"]), fx, fy, cx, cy, distortion)
 
 
-def camera_table(camera: Camera) -> dict[str, int | float]:
-    """Write a camera as a TOML table."""
-    return {k: getattr(camera, k) for k in ("width", "height", "fx", "fy", "cx", "cy")}
+def camera_table(camera: Camera) -> dict[str, Any]:
+    """Write a camera as a TOML table; a pinhole's has no ``distortion``."""
+    table = {k: getattr(camera, k) for k in ("width", "height", "fx", "fy", "cx", "cy")}
+    return {**table, "distortion": list(camera.distortion)} if camera.distortion else table
 
 
 def range_error_from(table: Mapping[str, Any]) -> RangeError:
     """Read one ``[[range_error]]`` table."""
     values = dict(table)
-    harmonics = tuple((int(m), float(a), float(b)) for m, a, b in values.pop("harmonics", []))
     try:
-        return RangeError(harmonics=harmonics, **values)
-    except TypeError as err:
+        harmonics = tuple((int(m), float(a), float(b)) for m, a, b in values.pop("harmonics", []))
+        image = tuple((int(i), int(j), float(c)) for i, j, c in values.pop("image", []))
+        return RangeError(harmonics=harmonics, image=image, **values)
+    except (TypeError, ValueError) as err:
         raise ConfigError(f"range_error: {err}", hint="see docs/formats.md, rig.toml") from err
 
 
@@ -144,6 +202,11 @@ def range_error_table(error: RangeError) -> dict[str, Any]:
     """Write a range error as a TOML table."""
     table = {k: getattr(error, k) for k in RangeError.__dataclass_fields__}
     table["harmonics"] = [list(h) for h in error.harmonics]
+    # Later terms are written where there are any: cameras without them keep the bytes of their files.
+    if image := table.pop("image"):
+        table["image"] = [list(c) for c in image]
+    if not error.per_inverse_amplitude:
+        del table["per_inverse_amplitude"]
     return table
 
 
@@ -182,8 +245,8 @@ def rig_from_dict(table: Mapping[str, Any], where: str = "rig") -> Rig:
             raise ConfigError(f"{where}: missing {key}")
     errors: Sequence[Mapping[str, Any]] = table.get("range_error", [])
     return Rig(
-        tof=_camera_from(table["tof"], f"{where}: [tof]"),
-        stereo=_camera_from(table["stereo"], f"{where}: [stereo]"),
+        tof=camera_from(table["tof"], f"{where}: [tof]"),
+        stereo=camera_from(table["stereo"], f"{where}: [stereo]"),
         T_tof_stereo=check_transform(table["T_tof_stereo"], f"{where}: T_tof_stereo"),
         T_flange_tof=check_transform(table["T_flange_tof"], f"{where}: T_flange_tof"),
         illuminator=np.asarray(table["tof"].get("illuminator", [0, 0, 0]), dtype=np.float64),

@@ -7,16 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from tofcapture.camera import Camera
 from tofcapture.errors import FormatError, TofError
 from tofcapture.frames import StereoInfo, TofInfo
-from tofcapture.rig import camera_table, range_error_from, range_error_table
-
-
-def _camera(table: Mapping[str, Any]) -> Camera:
-    return Camera(
-        int(table["width"]), int(table["height"]), *(float(table[k]) for k in ("fx", "fy", "cx", "cy"))
-    )
+from tofcapture.rig import camera_from, camera_table, range_error_from, range_error_table
 
 
 def tof_table(info: TofInfo) -> dict[str, Any]:
@@ -46,7 +39,7 @@ def tof_from(table: Mapping[str, Any], where: str) -> TofInfo:
         return TofInfo(
             model=str(table["model"]),
             serial=str(table["serial"]),
-            camera=_camera(table["camera"]),
+            camera=camera_from(table["camera"], where),
             illuminator=np.asarray(table["illuminator"], dtype=np.float64),
             modulation_hz=tuple(float(f) for f in table["modulation_hz"]),
             phase_rad=tuple(float(p) for p in table["phase_rad"]),
@@ -66,6 +59,6 @@ def stereo_table(info: StereoInfo) -> dict[str, Any]:
 def stereo_from(table: Mapping[str, Any], where: str) -> StereoInfo:
     """Read what :func:`stereo_table` wrote; :class:`FormatError` when it cannot be."""
     try:
-        return StereoInfo(str(table["model"]), str(table["serial"]), _camera(table["camera"]))
+        return StereoInfo(str(table["model"]), str(table["serial"]), camera_from(table["camera"], where))
     except (KeyError, TypeError, ValueError, TofError) as err:
         raise FormatError(f"{where}: stereo_info does not describe a stereo camera: {err!r}") from err

@@ -1,0 +1,201 @@
+"""Raw frames of any make: arrays in NPY, NPZ and HDF5, and folders of images, brought into (frames, K, H, W)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.errors import ConfigError, DataError, FormatError
+
+IMAGES = (".png", ".tif", ".tiff", ".pgm", ".bmp")
+BINARY = (".raw", ".bin")
+HEADER_ROWS = 4  # at most so many rows of an image are metadata
+
+
+def read_raw(path: Path, channels: int, shape: tuple[int, int] | None = None) -> NDArray[Any]:
+    """Read raw frames.
+
+    Parameters
+    ----------
+    path
+        ``.npy``, ``.npz`` or ``.h5`` (the one array of 3 or more axes in it), a folder of images or of binary files, or one binary file.
+    channels
+        Phase images of one frame: 4 per frequency.
+    shape
+        (H, W) of binary files, which do not say.
+
+    Returns
+    -------
+    (frames, K, H, W), native byte order, rows of metadata taken off.
+
+    Raises
+    ------
+    DataError, FormatError
+        No such file, nothing in it, sizes that do not fit.
+    """
+    if not path.exists():
+        raise DataError(f"{path}: no such file")
+    if path.is_dir():
+        found = _folder(path, shape)
+    elif path.suffix.lower() in {".npy", ".npz"}:
+        found = _numpy(path)
+    elif path.suffix.lower() in {".h5", ".hdf5", ".hdf"}:
+        found = _hdf5(path)
+    elif path.suffix.lower() in BINARY:
+        found = _binary(path, shape)
+    else:
+        raise FormatError(
+            f"{path}: expected .npy, .npz, .h5, .raw, .bin or a folder of images, got {path.suffix!r}"
+        )
+    return signed(without_metadata(_framed(found, channels, str(path))))
+
+
+def _numpy(path: Path) -> NDArray[Any]:
+    try:
+        held = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as err:
+        raise FormatError(f"{path}: expected an array in .npy or .npz format, got {err}") from err
+    return held if isinstance(held, np.ndarray) else np.asarray(_only({k: held[k] for k in held.files}, path))
+
+
+def _hdf5(path: Path) -> NDArray[Any]:
+    import h5py
+
+    held: dict[str, Any] = {}
+
+    def keep(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and item.ndim >= 3:
+            held[name] = item
+
+    try:
+        with h5py.File(path, "r") as file:
+            file.visititems(keep)
+            return np.asarray(_only(held, path)[...])
+    except OSError as err:
+        raise FormatError(f"{path}: expected an HDF5 file, got {err}") from err
+
+
+def _only(arrays: dict[str, Any], path: Path) -> Any:
+    """The array called raw, or the only one with images in it."""
+    images = {k: v for k, v in arrays.items() if v.ndim >= 3}
+    raw = {
+        k: v for k, v in images.items() if k.rsplit("/", 1)[-1].lower() in {"raw", "frames", "taps", "data"}
+    }
+    chosen = raw or images
+    if len(chosen) != 1:
+        raise FormatError(
+            f"{path}: expected one array of images, got {', '.join(f'{k} {v.shape}' for k, v in chosen.items()) or 'none'}",
+            hint="call it raw, or save it alone as .npy",
+        )
+    return next(iter(chosen.values()))
+
+
+def _folder(path: Path, shape: tuple[int, int] | None) -> NDArray[Any]:
+    """Images in the natural order of their names, one phase each."""
+    files = [p for p in path.iterdir() if p.suffix.lower() in (*IMAGES, *BINARY)]
+    files.sort(key=lambda p: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", p.name)])
+    if not files:
+        raise DataError(
+            f"{path}: expected images ({', '.join(IMAGES)}) or binary files ({', '.join(BINARY)}), found none"
+        )
+    planes = [_image(p) if p.suffix.lower() in IMAGES else _binary(p, shape) for p in files]
+    sizes = {p.shape for p in planes}
+    if len(sizes) > 1:
+        raise FormatError(f"{path}: expected images of one size, got {sorted(sizes)}")
+    return np.concatenate(planes) if planes[0].ndim == 3 else np.stack(planes)
+
+
+def _image(path: Path) -> NDArray[Any]:
+    try:
+        import cv2
+    except ImportError as err:
+        raise ConfigError(
+            f"{path}: reading images needs OpenCV",
+            hint="pip install opencv-python-headless, or convert to .npy",
+        ) from err
+    found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if found is None:
+        raise FormatError(f"{path}: expected an image")
+    if found.ndim == 3:
+        if (found[..., :1] != found[..., :3]).any():
+            raise FormatError(f"{path}: expected one channel of grey, got colours")
+        found = found[..., 0]
+    return np.asarray(found)
+
+
+def _binary(path: Path, shape: tuple[int, int] | None) -> NDArray[Any]:
+    """16-bit words; the byte order is the one in which neighbours are alike."""
+    if shape is None:
+        raise FormatError(f"{path}: a binary file does not say its size", hint="--shape H,W")
+    words = np.frombuffer(path.read_bytes(), dtype="<u2")
+    size = shape[0] * shape[1]
+    if not len(words) or len(words) % size:
+        raise FormatError(
+            f"{path}: expected a multiple of {shape[0]} x {shape[1]} 16-bit words, got {len(words)}",
+            hint=f"rows of metadata count: {len(words) / shape[1]:g} rows of {shape[1]} in all",
+        )
+    images = words.reshape(-1, *shape)
+    return min((images, images.byteswap()), key=_roughness)
+
+
+def _roughness(images: NDArray[Any]) -> float:
+    rows = images.astype(np.float64)
+    return float(np.median(np.abs(np.diff(rows, axis=-1)))) / max(float(np.std(rows)), 1e-9)
+
+
+def _framed(raw: NDArray[Any], channels: int, where: str) -> NDArray[Any]:
+    """Bring (N, H, W), (K, H, W), (N, K, H, W) and channels-last arrays into (frames, K, H, W)."""
+    if raw.dtype.kind not in "iuf":
+        raise FormatError(f"{where}: expected numbers, got {raw.dtype}")
+    raw = raw.astype(raw.dtype.newbyteorder("="), copy=False)
+    if raw.ndim == 5 and 1 in raw.shape[:2]:
+        raw = raw.reshape(raw.shape[0] * raw.shape[1], *raw.shape[2:])
+    if raw.ndim == 4 and raw.shape[1] != channels and raw.shape[-1] == channels:
+        raw = np.moveaxis(raw, -1, 1)
+    if raw.ndim == 4 and 2 * raw.shape[1] == channels and len(raw) % 2 == 0:
+        raw = raw.reshape(-1, channels, *raw.shape[2:])  # the frequencies take turns from frame to frame
+    if raw.ndim == 3 and raw.shape[0] % channels and raw.shape[-1] == channels:
+        raw = np.moveaxis(raw, -1, 0)
+    if raw.ndim == 3 and len(raw) and len(raw) % channels == 0:
+        raw = raw.reshape(-1, channels, *raw.shape[1:])
+    if raw.ndim != 4 or raw.shape[1] != channels or not len(raw):
+        raise DataError(
+            f"{where}: expected (frames, {channels}, H, W) or a multiple of {channels} images, got shape {raw.shape}",
+            hint="--mhz says how many frequencies there are: 4 phase images each",
+        )
+    return raw
+
+
+def signed(raw: NDArray[Any]) -> NDArray[Any]:
+    """Give negative numbers back their sign where they were stored as the upper half of 12, 14 or 16 bits.
+
+    Differences of taps lie about zero: unsigned, they crowd at both ends of the scale and leave its middle empty.
+    """
+    if raw.dtype.kind != "u" or raw.max(initial=0) < 1 << 11:
+        return raw
+    bits = next(b for b in (12, 14, 16, 32, 64) if int(raw.max()) < 1 << b)
+    share = raw.astype(np.float64) / (1 << bits)
+    middle = float(((share > 0.3) & (share < 0.7)).mean())
+    ends = min(float((share < 0.3).mean()), float((share > 0.7).mean()))
+    if middle > 0.01 or ends < 0.05:
+        return raw
+    return np.where(share >= 0.5, raw.astype(np.int64) - (1 << bits), raw.astype(np.int64))
+
+
+def without_metadata(raw: NDArray[Any]) -> NDArray[Any]:
+    """Take off first and last rows that are no image: their neighbours in the column say nothing of them.
+
+    Cameras write temperature and counters there (method.md 0.4). A row is metadata when it differs from the row inside it by more than
+    five times what the rows of the image differ by.
+    """
+    mean = raw.reshape(-1, *raw.shape[-2:]).astype(np.float64).mean(axis=0)
+    step = np.median(np.abs(np.diff(mean, axis=0)), axis=1) + 1e-9
+    typical = float(np.median(step[HEADER_ROWS:-HEADER_ROWS])) if len(step) > 4 * HEADER_ROWS else np.inf
+    odd = step > 5 * typical + 0.02 * float(np.median(np.abs(mean)))
+    first = max((i + 1 for i in range(HEADER_ROWS) if i < len(odd) and odd[i]), default=0)
+    last = max((i + 1 for i in range(HEADER_ROWS) if i < len(odd) and odd[-1 - i]), default=0)
+    return raw[..., first : raw.shape[-2] - last, :]

@@ -1,0 +1,83 @@
+"""A lens from the board's edges: what made the rims comes out, error bars hold, and a pinhole stays one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration.board import load_board
+from calibration.board_model import Model, clear_of_walls
+from calibration.lens_board import BoardSeen, fit_lens_to_board
+from calibration.lens_cli import report, table
+from tofcapture import poses
+from tofcapture.camera import Camera
+from tofcapture.errors import DataError
+from tofcapture.poses import invert, look_at
+from tofcapture.rig import Rig
+
+MODEL = Model(load_board())
+TRUE = Camera(240, 180, 191.5, 200.2, 117.9, 100.6, (-0.12, 0.05, 0.0008, -0.0006, 0.0))
+GUESS = Camera(240, 180, 189.0, 202.5, 119.5, 98.5)
+
+
+def seen(camera, count=14, noise=0.15, growth=0.2, seed=0):
+    """Rims of tilted boards, seen through a lens, all plates too large by some of a pixel."""
+    rng, out = np.random.default_rng(seed), []
+    middle = np.r_[
+        (MODEL.board.outline.max(axis=0) + MODEL.board.outline.min(axis=0)) / 2, MODEL.board.thickness
+    ]
+    for i in range(count):
+        tilt, turn, far = np.radians(rng.uniform(15, 40)), 2.4 * i, rng.uniform(0.35, 0.8)
+        way = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
+        aim = middle + np.r_[rng.uniform(-0.1, 0.1, 2), 0]
+        T = invert(look_at(aim + far * way, aim, up=[0, 1, 0], roll=rng.uniform(-1, 1)))
+        xy = np.concatenate(
+            [
+                np.linspace(a, b, 25, endpoint=False)
+                for r in MODEL.board.rings
+                for a, b in zip(r, np.roll(r, -1, axis=0), strict=False)
+            ]
+        )
+        edges = MODEL.edges(xy + 1e-7)
+        clear = clear_of_walls(T, MODEL.board, xy, edges.outward)
+        at = poses.transform_points(T, np.column_stack([xy, np.full(len(xy), MODEL.board.thickness)]))
+        out_px = camera.project(at + 1e-4 * edges.outward @ T[:3, :2].T)[0] - camera.project(at)[0]
+        pixels = camera.project(at)[0] + growth * out_px / np.linalg.norm(out_px, axis=1, keepdims=True)
+        pixels += rng.normal(0, noise, pixels.shape)
+        good = clear & (pixels > 3).all(axis=1) & (pixels < [236, 176]).all(axis=1)
+        off = poses.exp(np.r_[rng.normal(0, 0.003, 3), rng.normal(0, 0.01, 3)])
+        out.append(BoardSeen(f"view-{i:03d}", pixels[good][:: max(1, good.sum() // 300)], off @ T))
+    return out
+
+
+def farthest(a, b):
+    """Largest disagreement of two lenses over the image, pixels, a common turn taken off."""
+    off = (a.rays - b.rays)[..., :2] * [b.fx, b.fy]
+    return np.abs(off - off.mean(axis=(0, 1))).max()
+
+
+def test_the_lens_that_made_the_rims_comes_out():
+    """Rims with 0.15 px of noise that all lie 0.2 px off give the lens to half a pixel, and say that it is distorted."""
+    fit = fit_lens_to_board(MODEL, seen(TRUE), GUESS)
+    assert fit.model != "pinhole"
+    assert farthest(fit.camera, TRUE) < 0.6
+    assert abs(fit.camera.fx - TRUE.fx) < 4 * fit.sigma[0] + 0.05
+    assert fit.rms < 0.3
+    data = report(fit, Rig(GUESS, Camera(1280, 1024, 1155.0, 1155.0, 639.5, 511.5), np.eye(4), np.eye(4)))
+    assert "fx" in table({**data, "refused": []})
+
+
+def test_a_pinhole_stays_one():
+    """Where no distortion is, none is written, and the pinhole's numbers come back."""
+    plain = replace(TRUE, distortion=())
+    fit = fit_lens_to_board(MODEL, seen(plain, seed=1), GUESS)
+    assert fit.camera.distortion == ()
+    assert farthest(fit.camera, plain) < 0.4
+
+
+def test_too_few_views_are_refused():
+    """Three views say so."""
+    with pytest.raises(DataError, match="at least 5"):
+        fit_lens_to_board(MODEL, seen(TRUE, 3), GUESS)

@@ -1,0 +1,182 @@
+"""Range calibration: the terms that were put into a made sensor come out, and what the data cannot tell is said."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration import calibrate_cli
+from calibration.range_fit import fit_ranges
+from calibration.range_surface import surface_at_pixels
+from calibration.range_views import seen_of
+from tofcapture import poses
+from tofcapture.camera import Camera
+from tofcapture.devices.sim.light import Light
+from tofcapture.devices.sim.sensor import Sensor, expose
+from tofcapture.errors import DataError, QualityError, UsageError
+from tofcapture.files.view import view_path, write_view
+from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, View
+from tofcapture.ops import phase
+from tofcapture.rig import SPEED_OF_LIGHT, RangeError, Rig, dumps_rig, image_places, load_rig, loads_rig
+
+CAMERA = Camera(120, 90, 95.3, 100.4, 58.4, 50.7)
+STEREO = Camera(480, 384, 420.0, 420.0, 239.5, 191.5)
+T_TOF_STEREO = poses.transform(poses.rotation_exp([0.03, 0.01, 0.02]), [-0.05, 0.03, 0.004])
+INFO = TofInfo("made", "1", CAMERA, np.array([0.007, 0.0, 0.0]))
+ERRORS = (
+    RangeError(20e6, 0.017, 0.0, ((4, 0.012, 0.0),), 1.5e-4, image=((1, 0, 0.002), (0, 2, -0.0015))),
+    RangeError(100e6, 0.017, 0.0, ((2, -0.0058, 0.0015), (4, 0.0005, 0.0)), 1.5e-4, image=((1, 1, 0.002),)),
+)
+SENSOR = Sensor(range_errors=ERRORS, scattering=0.0, pixel_offset=0.0003, celsius_drift=0.0)
+VIEWS = 16
+
+
+def plane_depth(camera, T_camera_tof, normal, centre):
+    """Depth image of the plane through ``centre`` (ToF frame) and the cosine at its pixels."""
+    n = T_camera_tof[:3, :3] @ normal
+    c = T_camera_tof[:3, :3] @ centre + T_camera_tof[:3, 3]
+    return (n @ c) / (camera.rays @ n)
+
+
+def made_view(index, rng, sensor=SENSOR, thrown_back=0.0, grey=False, celsius=45.0, away=None):
+    """A tilted board as both cameras see it; a share of light that took a longer way falls on it."""
+    tilt, turn = np.radians(rng.uniform(5, 35)), 2.399963 * index
+    away = 0.3 + 1.2 * index / (VIEWS - 1) if away is None else away
+    normal = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
+    centre = np.array([0.0, 0.0, away])
+    depth = plane_depth(CAMERA, np.eye(4), normal, centre)
+    radial = CAMERA.depth_to_radial(depth)
+    range_ = phase.radial_to_range(radial, CAMERA, INFO.illuminator)
+    cosine = -(CAMERA.rays @ normal) / CAMERA.ray_lengths
+    albedo = np.where(image_places(CAMERA)[..., 0] * 7 % 2 < 1, 0.15, 0.9) if grey else 0.9
+    steady = albedo * cosine / radial**2
+    k = 4 * np.pi / SPEED_OF_LIGHT * np.array([20e6, 100e6])[:, None, None]
+    phasor = steady * (np.exp(1j * k * range_) + thrown_back * np.exp(1j * k * (range_ + 0.4)))
+    raw, warm = expose(Light(phasor, steady), replace(sensor, celsius=celsius), INFO, 4, rng, 3)
+    z = plane_depth(STEREO, poses.invert(T_TOF_STEREO), normal, centre)
+    points = STEREO.unproject(z + rng.normal(0, 0.0004, z.shape)).astype(np.float32)
+    arm = ArmState(np.zeros(6), np.eye(4), 0)
+    return View(
+        "calibration",
+        index,
+        TofBurst(raw, np.arange(4), warm, INFO),
+        StereoFrame(points, 0, StereoInfo("made", "2", STEREO)),
+        arm,
+        arm,
+        Rig(CAMERA, STEREO, T_TOF_STEREO, np.eye(4), INFO.illuminator),
+    )
+
+
+def made(index, rng, **more):
+    """The same, reduced."""
+    return seen_of(made_view(index, rng, **more), f"view-{index:03d}")
+
+
+def left(found, true):
+    """RMS over 0.3 to 1.5 m and the image of what the fitted error leaves, (F,) metres."""
+    out = []
+    for mine, theirs in zip(found, true, strict=True):
+        r = np.linspace(0.3, 1.5, 61)[:, None, None]
+        turned = 4 * np.pi * mine.modulation_hz / SPEED_OF_LIGHT * r
+        place, radius = image_places(CAMERA)[None], phase.radius_px(CAMERA)[None]
+        a, b = (e.at(turned, radius, 45.0, place, np.full((1, 1, 1), 200.0)) for e in (mine, theirs))
+        out.append(np.sqrt(np.mean(np.square(a - b))))
+    return np.array(out)
+
+
+def test_the_surface_is_right_to_a_hundredth_of_a_millimetre():
+    """A noise-free plane seen by the stereo camera gives its own depth at every ToF pixel that is good."""
+    normal, centre = np.array([0.3, 0.2, -0.93]) / np.linalg.norm([0.3, 0.2, -0.93]), np.array([0, 0, 0.7])
+    z = plane_depth(STEREO, poses.invert(T_TOF_STEREO), normal, centre)
+    points = poses.transform_points(T_TOF_STEREO, STEREO.unproject(z).reshape(-1, 3))
+    planes, good = surface_at_pixels(points, CAMERA)
+    assert good.mean() > 0.5
+    depth = 1 / (planes * CAMERA.rays).sum(axis=-1)
+    assert np.abs(depth - plane_depth(CAMERA, np.eye(4), normal, centre))[good].max() < 1e-5
+
+
+@pytest.mark.parametrize("guess", [np.zeros(6), np.array([2e-4, -3e-4, 3e-4, 3e-4, -3e-4, 2e-4])])
+def test_offset_waves_and_image_terms_come_out(guess):
+    """17 mm, a 6 mm wave and terms over the image: less than a millimetre is left at both frequencies."""
+    rng = np.random.default_rng(0)
+    seen = [made(i, rng) for i in range(VIEWS)]
+    T = poses.exp(guess) @ T_TOF_STEREO
+    fit = fit_ranges(seen, T, np.r_[[3e-4] * 3, [5e-4] * 3])
+    assert (left(fit.errors, ERRORS) < 1e-3).all(), left(fit.errors, ERRORS)
+    assert left(fit.errors, ERRORS)[1] < 8e-4
+    assert not any(t.warmth or t.darkness for t in fit.terms)
+
+
+def test_light_thrown_back_shows_as_spread_of_the_views():
+    """Views that receive other shares of a detour differ from each other, and the fit says by how much."""
+    rng = np.random.default_rng(1)
+    seen = [made(i, rng, thrown_back=float(rng.uniform(0, 0.03))) for i in range(VIEWS)]
+    fit = fit_ranges(seen, T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
+    assert fit.spread[0] > 0.001
+    clean = fit_ranges([made(i, rng) for i in range(VIEWS)], T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
+    assert (clean.spread < 0.0008).all(), clean.spread
+
+
+def test_temperature_and_darkness_are_fitted_when_they_vary():
+    """A drift of 0.3 mm/K and an error of dark surfaces are found once temperature and greys vary."""
+    errors = tuple(replace(e, per_kelvin=-3e-4, per_inverse_amplitude=0.15) for e in ERRORS)
+    sensor, rng = replace(SENSOR, range_errors=errors), np.random.default_rng(2)
+    celsius = 45 + 6 * np.sin(np.arange(VIEWS) * 1.7)
+    seen = [made(i, rng, sensor=sensor, grey=True, celsius=c) for i, c in enumerate(celsius)]
+    fit = fit_ranges(seen, T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
+    assert all(t.warmth and t.darkness for t in fit.terms)
+    assert fit.errors[1].per_kelvin == pytest.approx(-3e-4, abs=5e-5)
+    assert fit.errors[1].per_inverse_amplitude == pytest.approx(0.15, abs=0.05)
+    assert (left(fit.errors, errors) < 1e-3).all()
+
+
+def test_fitted_errors_correct_a_burst():
+    """A burst decoded with the fitted errors gives the depth of the board, by the reference and by the fast decoder."""
+    rng = np.random.default_rng(0)
+    fit = fit_ranges([made(i, rng) for i in range(VIEWS)], T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
+    away = made(40, rng, sensor=replace(SENSOR, read_noise=0.0, shot_noise=False, quantise=False), away=0.83)
+    decoded = phase.decode(away.phasor, INFO.modulation_hz, CAMERA, INFO.illuminator, fit.errors, 45.0)
+    planes, good = surface_at_pixels(poses.transform_points(T_TOF_STEREO, away.points), CAMERA)
+    off = decoded.radial - CAMERA.ray_lengths / (planes * CAMERA.rays).sum(axis=-1)
+    assert np.sqrt(np.mean(np.square(off[good]))) < 1e-3
+    errors = tuple(replace(e, per_inverse_amplitude=0.1) for e in fit.errors)
+    slow = phase.decode(away.phasor, INFO.modulation_hz, CAMERA, INFO.illuminator, errors, 45.0)
+    raw = phase.taps(away.phasor, 2 * np.abs(away.phasor), INFO.modulation_hz, INFO.phase_rad)
+    fast = phase.Decoder(replace(INFO, range_errors=errors))(raw, 45.0)
+    assert np.abs(fast.depth - CAMERA.radial_to_depth(slow.radial)).max() < 2e-5
+    assert np.abs(slow.radial - decoded.radial).max() > 1e-4
+    assert (
+        loads_rig(dumps_rig(Rig(CAMERA, STEREO, np.eye(4), np.eye(4), range_errors=errors))).range_errors
+        == errors
+    )
+
+
+def test_too_few_views_and_a_wrong_frequency_are_refused():
+    """Three views, and phases whose sign is reversed, have names."""
+    rng = np.random.default_rng(3)
+    with pytest.raises(DataError, match="at least 6"):
+        fit_ranges([made(i, rng) for i in range(3)], T_TOF_STEREO)
+    with pytest.raises(QualityError, match="no fixed difference"):
+        fit_ranges(
+            [replace(s, phasor=s.phasor.conj()) for s in (made(2 * i, rng) for i in range(8))], T_TOF_STEREO
+        )
+
+
+def test_command_writes_rig_and_report(tmp_path):
+    """calibrate range fits a recording, writes rig.toml and range.json, and says what it could not know."""
+    rng = np.random.default_rng(5)
+    for i in range(8):
+        write_view(view_path(tmp_path, "calibration", i), made_view(2 * i, rng))
+    parser = argparse.ArgumentParser()
+    calibrate_cli.COMMAND.configure(parser)
+    outcome = calibrate_cli.COMMAND.run(parser.parse_args(["range", str(tmp_path)]))
+    assert load_rig(tmp_path / "rig.toml").range_errors[1].modulation_hz == 100e6
+    assert json.loads((tmp_path / "range.json").read_text())["transform"] == "nothing"
+    assert "align" in outcome.text
+    assert "temperature varied" in outcome.text
+    with pytest.raises(UsageError, match="harmonics"):
+        calibrate_cli.COMMAND.run(parser.parse_args(["range", str(tmp_path), "--orders", "0"]))
