@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import shutil
 import sqlite3
 import subprocess
 import sys
+import time
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -18,8 +21,14 @@ import pytest
 from tofcapture.dataset.build import build_dataset
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
 from tofcapture.devices.sim.world import SimWorld, read_constants
+from tofcapture.errors import DataError
+from tofcapture.files import seal as sealing
+from tofcapture.files.cache import pack
 from tofcapture.files.check import check
+from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
+from tofcapture.files.migrate import migrate
 from tofcapture.files.seal import digest_path, sha256_of
+from tofcapture.files.shard import ShardReader
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, View
 from tofcapture.poses import invert, look_at
@@ -156,6 +165,12 @@ SHARD_DAMAGE = {
     "shape": (replaced("tof/celsius", np.zeros((1, 3))), "/tof/celsius"),
     "zero depth": (set_array("tof/depth", (0, 3, 4), 0.0), "/tof/depth[0]"),
     "depth where not hit": (set_array("gt/mask_2x", (0, slice(None)), 1), "/gt/mask_2x[0]"),
+    "unknown flag": (set_array("tof/flags", (0, 0, 0), 128), "/tof/flags[0]"),
+    "far": (set_array("tof/depth", (0, 3, 4), 31.0), "/tof/depth[0]"),
+    "negative amplitude": (set_array("tof/confidence", (0, 3, 4), -1.0), "/tof/confidence[0]"),
+    "hot": (set_array("tof/celsius", (0, 1), 200.0), "/tof/celsius"),
+    "out of reach": (set_array("views/T_base_tof", (0, 0, 3), 25.0), "/views/T_base_tof"),
+    "negative index": (set_array("views/index", 0, -1), "/views/index"),
     "unknown bit": (set_array("gt/mask_1x", (0, 0, 0), 33), "/gt/mask_1x[0]"),
     "not rigid": (set_array("views/T_base_tof", (0, 0, 0), 2.0), "/views/T_base_tof"),
     "time": (set_array("tof/time_ns", (0, 1), 0), "/tof/time_ns"),
@@ -249,13 +264,14 @@ def test_a_dataset_disagrees_with_its_manifest(here):
     scenes["gone"] = {**scenes["gear"], "path": "shards/gone.h5"}
     scenes["gear"]["sha256"] = "0" * 64
     shutil.copy(dataset / "shards/gear.h5", dataset / "shards/stray.h5")
-    (dataset / "manifest.json").write_text(json.dumps(manifest))
+    write_manifest(dataset, Manifest({n: SceneEntry(**e) for n, e in scenes.items()}))
     found = {(p.path.name, p.where) for p in check(dataset)}
     assert found == {
         ("manifest.json", "box"),
         ("gone.h5", ""),
         ("gear.h5", ""),
         ("stray.h5", ""),
+        ("box-2.h5", "view 0"),
         ("croissant.json", "distribution"),
     }
     assert any("box" in p.where and "is in" in p.message for p in check(dataset))
@@ -299,3 +315,113 @@ def test_simulated_views_of_other_poses_are_fine(tmp_path):
     path = tmp_path / "views/box/view-003.h5"
     write_view(path, replace(simulate("box", 3), truth=None))
     assert check(path) == []
+
+
+def as_scene(dataset, old, new, change=lambda _file: None):
+    """Copy a shard as another scene's; returns its entry of the manifest."""
+    path = dataset / f"shards/{new}.h5"
+    shutil.copy(dataset / f"shards/{old}.h5", path)
+    edit(path, lambda f: (set_attr("scene", new)(f), change(f)))
+    return replace(load_manifest(dataset).scenes[old], path=f"shards/{new}.h5", sha256=sha256_of(path))
+
+
+def test_the_same_frames_under_two_names_are_found(here):
+    """A view that is in two scenes, whatever else differs, and one that is twice in a scene."""
+    dataset = here / "dataset"
+    manifest = load_manifest(dataset)
+    entry = as_scene(dataset, "box", "cup", set_array("tof/celsius", (0, 0), 20.0))
+    write_manifest(dataset, replace(manifest, scenes={**manifest.scenes, "cup": entry}))
+    found = [(p.path.name, p.where, p.message) for p in check(dataset) if p.path.name != "croissant.json"]
+    assert found == [("cup.h5", "view 0", "the same frames as view 0 of box")]
+
+
+def test_an_object_in_two_splits_is_found_by_what_the_data_say(here):
+    """Scenes of other names share an object: by their provenance, or by the simulation's note."""
+    dataset = here / "dataset"
+    manifest = load_manifest(dataset)
+    noisy = set_array("tof/raw", (0, 0, 0, 0), 7)
+    objects = set_attr("provenance", json.dumps({"objects": ["bowl"]}))
+    one = as_scene(dataset, "box", "cup", lambda f: (noisy(f), objects(f)))
+    write_manifest(dataset, replace(manifest, scenes={**manifest.scenes, "cup": replace(one, split="val")}))
+    (dataset / "simulation").mkdir()
+    (dataset / "simulation/gear.json").write_text(json.dumps({"objects": ["bowl"]}))
+    problems = [p for p in check(dataset) if p.path.name == "manifest.json"]
+    assert [p.where for p in problems] == ["bowl"]
+    assert "val (cup)" in problems[0].message
+
+
+def test_strays_and_stale_caches_are_found(here):
+    """Files that nobody lists; a cache in the dataset that is damaged, then stale; the same cache looked at by itself."""
+    dataset = here / "dataset"
+    split = load_manifest(dataset).scenes["box"].split
+    pack(dataset, split, dataset / "cache")
+    (dataset / "LICENSE").write_text("x")
+    assert check(dataset) == []
+    assert check(dataset / "cache") == []
+    (dataset / "shards/notes.txt").write_text("x")
+    (dataset / "old.h5").write_text("x")
+    (dataset / "cache/extra").write_text("x")
+    assert {p.path.name for p in check(dataset)} == {"notes.txt", "old.h5", "extra"}
+    path = dataset / "cache/box.bin"
+    data = bytearray(path.read_bytes())
+    data[1000] ^= 1
+    path.write_bytes(data)
+    assert "box.bin" in {p.path.name for p in check(dataset / "cache")}
+    edit(dataset / "shards/box.h5", set_array("tof/celsius", (0, 0), 20.0))
+    manifest = load_manifest(dataset)
+    box = replace(manifest.scenes["box"], sha256=sha256_of(dataset / "shards/box.h5"))
+    write_manifest(dataset, replace(manifest, scenes={**manifest.scenes, "box": box}))
+    assert any("stale: box" in p.message for p in check(dataset))
+
+
+def test_random_damage_is_reported_and_never_read(tmp_path):
+    """Sixty random corruptions: check reports each, readers raise named errors or give what was stored."""
+    script = Path(__file__).parents[1] / "benchmarks/mutations.py"
+    done = subprocess.run(
+        [sys.executable, str(script), "--count", "60", "--seed", "1", "--json"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    result = json.loads(done.stdout)
+    assert (result["corruptions"], result["reported"]) == (60, 60)
+    assert set(result["reads"]) == {"right", "named error"}, result
+    assert result["reads"]["named error"] > 40
+
+
+def test_a_reader_hashes_a_file_once(here, monkeypatch):
+    """A file that nobody touches is hashed once per process, and not in a process that a reader is sent to; a changed one is."""
+    path = here / "dataset/shards/box.h5"
+    later = time.time() + 60
+    monkeypatch.setattr(sealing.time, "time", lambda: later)
+    hashed = []
+    real = sealing.sha256_of
+    monkeypatch.setattr(sealing, "sha256_of", lambda p: hashed.append(p) or real(p))
+    for _ in range(2):
+        with ShardReader(path) as shard:
+            assert shard.views == 1
+    assert hashed == [path]
+    sent = pickle.dumps(ShardReader(path))
+    monkeypatch.setattr(sealing, "_digests", {})
+    assert pickle.loads(sent).views == 1  # noqa: S301
+    assert hashed == [path]
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.chmod(0o644)
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="sha256"):
+        ShardReader(path).views  # noqa: B018
+    assert hashed == [path, path]
+
+
+def test_a_manifest_of_the_first_version(here):
+    """It is read as it was; check says that it does not vouch for itself; migrate signs it."""
+    dataset = here / "dataset"
+    path = dataset / "manifest.json"
+    manifest, table = load_manifest(dataset), json.loads(path.read_text())
+    del table["sha256"]
+    path.write_text(json.dumps({**table, "version": 1}, indent=1, sort_keys=True) + "\n")
+    assert load_manifest(dataset) == manifest
+    assert [p.hint.split()[1] for p in check(dataset) if p.path.name == "manifest.json"] == ["migrate"]
+    migrate(dataset)
+    assert check(dataset) == []

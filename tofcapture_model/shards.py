@@ -67,7 +67,7 @@ def open_scenes(folder: Path, split: str, cache: Path | None = None) -> dict[str
     """
     entries = load_manifest(folder).split(split)
     if cache is None:
-        return {name: ShardReader(Path(folder) / entry.path) for name, entry in entries.items()}
+        return {name: ShardReader(Path(folder) / entry.path, entry.sha256) for name, entry in entries.items()}
     packed = open_cache(cache, folder)
     if packed.keys() != entries.keys():
         raise DataError(

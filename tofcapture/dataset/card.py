@@ -1,15 +1,17 @@
-"""The dataset's card (``README.md``) and its Croissant description."""
+"""The dataset's card (``README.md``), a datasheet of what the data tell, and its Croissant description."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from tofcapture.files.layout import SHARD, SPLITS
-from tofcapture.files.manifest import Manifest
-from tofcapture.files.seal import write_text
+from tofcapture.dataset.croissant import croissant
+from tofcapture.files.layout import SPLITS
+from tofcapture.files.manifest import Manifest, manifest_path, object_of
+from tofcapture.files.seal import sha256_of, write_text
 from tofcapture.files.shard import ShardReader
 
 _FRONT = """\
@@ -23,41 +25,11 @@ tags:
 - robotics
 ---
 """
-
-_BODY = """\
-# {name}
-
-Raw time-of-flight phase images with stereo ground truth: {views} views of {scenes} scenes, {frames} ToF frames each.
-ToF {tof} ({W} x {H}), stereo {stereo} ({SW} x {SH}). Lengths are metres.
-
-| split | scenes | views |
-|---|---|---|
-{splits}
-
-## Reading
-
-```python
-from tofcapture.files.shard import ShardReader
-
-with ShardReader("{first}") as shard:
-    raw = shard.raw(view=0, frame=0)          # phase images, the sensor's integers
-    gt = shard.ground_truth(view=0, scale=2)  # depth, normals, mask; mask == 0 is good
-```
-
-Plain h5py opens the files as well; every dataset carries its `units` and `description`. `manifest.json` holds the splits
-and the SHA-256 of every shard; `tofcapture check .` verifies all of it.
-
-## Ground truth
-
-Stereo points, aligned by averaged ICP, denoised, triangulated and ray-cast onto the ToF plane at 1x and 2x. The mask says
-for each pixel why not to trust it (not hit, occluded for the stereo camera, grazing, at a depth edge, outside the object).
-{error}
-
-## Limits
-
-Splits are by object. Black, transparent and mirroring surfaces have little or no ground truth; pixels without it are
-marked, never filled.
-"""
+_SIMULATED = (
+    "Simulated: nothing here was measured. A renderer played both cameras and the arm, with the noise and the errors of its "
+    "models."
+)
+_MEASURED = "Recorded on a robot arm that carries both cameras."
 
 
 def _error_line(gt: Mapping[str, Any] | None) -> str:
@@ -76,63 +48,72 @@ def _split_rows(manifest: Manifest) -> str:
     )
 
 
-def card_text(dataset: Path, manifest: Manifest, gt: Mapping[str, Any] | None) -> str:
-    """Markdown of the card; ``gt`` is a :meth:`TruthError.table`."""
-    name = dataset.resolve().name
-    first = manifest.scenes[min(manifest.scenes)]
-    with ShardReader(dataset / first.path) as shard:
+def _good_share(shards: Mapping[str, Mapping[str, Any]], pixels: int) -> str:
+    """Share of good ground-truth pixels, from what each shard's provenance counted."""
+    views = [view for provenance in shards.values() for view in provenance.get("views", ())]
+    if not views or not all(isinstance(v, dict) and "good_pixels" in v for v in views):
+        return "An unknown share"
+    return f"{sum(v['good_pixels'] for v in views) / (pixels * len(views)):.0%}"
+
+
+def _size(dataset: Path, manifest: Manifest) -> str:
+    total = sum((dataset / e.path).stat().st_size for e in manifest.scenes.values())
+    return f"{total / 1e9:.2f} GB" if total > 1e8 else f"{total / 1e6:.2f} MB"
+
+
+def _provenances(dataset: Path, manifest: Manifest) -> dict[str, Mapping[str, Any]]:
+    out: dict[str, Mapping[str, Any]] = {}
+    for name, entry in manifest.scenes.items():
+        with ShardReader(dataset / entry.path, entry.sha256) as shard:
+            out[name] = shard.provenance
+    return out
+
+
+def _of_first(dataset: Path, manifest: Manifest) -> dict[str, Any]:
+    """What one shard tells of all: sensors, sizes, whether it was simulated."""
+    entry = manifest.scenes[min(manifest.scenes)]
+    with ShardReader(dataset / entry.path, entry.sha256) as shard:
         (H, W), (SH, SW) = shard.camera.shape, shard.rig.stereo.shape
-        body = _BODY.format(
-            name=name,
-            views=sum(e.views for e in manifest.scenes.values()),
-            scenes=len(manifest.scenes),
-            frames=shard.frames,
-            tof=shard.info.model,
-            stereo=shard.stereo_info.model,
-            H=H,
-            W=W,
-            SH=SH,
-            SW=SW,
-            splits=_split_rows(manifest),
-            first=first.path,
-            error=_error_line(gt),
-        )
-    return _FRONT.format(name=name) + body
-
-
-def croissant(dataset: Path, manifest: Manifest) -> dict[str, Any]:
-    """Croissant 1.0 description: the shards as file objects with their digests."""
-    files = [
-        {
-            "@type": "cr:FileObject",
-            "@id": f"shard-{name}",
-            "name": name,
-            "description": f"{entry.views} views, split {entry.split}",
-            "contentUrl": entry.path,
-            "encodingFormat": "application/x-hdf5",
-            "sha256": entry.sha256,
+        simulated = shard.truth(0) is not None
+        megahertz = sorted({float(f) / 1e6 for f in shard.info.modulation_hz})
+        return {
+            "frames": shard.frames,
+            "tof": shard.info.model,
+            "stereo": shard.stereo_info.model,
+            "K": len(shard.info.modulation_hz),
+            "mhz": " and ".join(f"{f:g}" for f in megahertz),
+            "H": H,
+            "W": W,
+            "SH": SH,
+            "SW": SW,
+            "first": entry.path,
+            "collection": _SIMULATED if simulated else _MEASURED,
+            "truth": "\n- `/truth/*`: exact depth and normals at 2x, of the simulator." if simulated else "",
         }
-        for name, entry in sorted(manifest.scenes.items())
-    ]
-    return {
-        "@context": {
-            "@language": "en",
-            "@vocab": "https://schema.org/",
-            "cr": "http://mlcommons.org/croissant/",
-            "sc": "https://schema.org/",
-            "conformsTo": "dct:conformsTo",
-            "dct": "http://purl.org/dc/terms/",
-        },
-        "@type": "sc:Dataset",
-        "conformsTo": "http://mlcommons.org/croissant/1.0",
-        "name": dataset.resolve().name,
-        "description": f"Raw time-of-flight phase images with stereo ground truth ({SHARD.format} {SHARD.version}).",
-        "distribution": files,
+
+
+def card_text(dataset: Path, manifest: Manifest, gt: Mapping[str, Any] | None) -> str:
+    """Markdown of the card; the manifest is written, ``gt`` is a :meth:`TruthError.table`."""
+    name, first = dataset.resolve().name, _of_first(dataset, manifest)
+    facts = {
+        "name": name,
+        "views": sum(e.views for e in manifest.scenes.values()),
+        "scenes": len(manifest.scenes),
+        "things": len({object_of(s) for s in manifest.scenes}),
+        "splits": _split_rows(manifest),
+        "size": _size(dataset, manifest),
+        "error": _error_line(gt),
+        "good": _good_share(_provenances(dataset, manifest), 4 * first["H"] * first["W"]),
+        "versions": ", ".join(f"{k} {v}" for k, v in sorted(manifest.versions.items())) or "unknown versions",
+        "config": ", ".join(f"{k} = {v}" for k, v in sorted(manifest.config.items())) or "unknown",
+        "manifest": sha256_of(manifest_path(dataset)),
     }
+    sheet = files("tofcapture.dataset").joinpath("datasheet.md").read_text(encoding="utf-8")
+    return _FRONT.format(name=name) + sheet.format(**first, **facts)
 
 
 def write_card(dataset: Path, manifest: Manifest, gt: Mapping[str, Any] | None) -> None:
-    """Write ``README.md`` and ``croissant.json``; nothing for a dataset without scenes."""
+    """Write ``README.md`` and ``croissant.json`` beside the manifest; nothing for a dataset without scenes."""
     if not manifest.scenes:
         return
     write_text(dataset / "README.md", card_text(dataset, manifest, gt))

@@ -13,7 +13,6 @@ and one whose shards have changed since is refused.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,13 +20,13 @@ from typing import Any
 import numpy as np
 
 from tofcapture.errors import DataError, FormatError
-from tofcapture.files.hdf import dumps
 from tofcapture.files.info import tof_table
 from tofcapture.files.layout import SPLITS
 from tofcapture.files.manifest import SceneEntry, load_manifest
 from tofcapture.files.packed import AGAIN, SCALE, PackedScene, dtype_from, dtype_table, record_dtype
 from tofcapture.files.seal import fsync, partial_path, sealed_digest, sha256_of, write_text
 from tofcapture.files.shard import ShardReader
+from tofcapture.files.signed import parse_json, parse_signed, signed_text
 
 FORMAT, VERSION = "tofcapture-cache", 1
 _INDEX = "index.json"
@@ -69,7 +68,7 @@ def pack(
         known = index["scenes"].get(name)
         if known is None or known["shard_sha256"] != entry.sha256 or not _whole(out, name, known):
             index["scenes"][name] = _pack_scene(dataset / entry.path, entry, out / f"{name}.bin", progress)
-            write_text(out / _INDEX, dumps(index) + "\n")
+            write_text(out / _INDEX, signed_text(index))
     _forget(out, index, entries)
     return open_cache(out, dataset)
 
@@ -100,7 +99,7 @@ def _pack_scene(
             f"{shard_path}: is not the shard of the manifest", hint=f"tofcapture check {shard_path}"
         )
     partial, digest = partial_path(path), hashlib.sha256()
-    with ShardReader(shard_path) as shard, partial.open("wb") as file:
+    with ShardReader(shard_path, entry.sha256) as shard, partial.open("wb") as file:
         dtype = record_dtype(shard)
         for view in range(shard.views):
             record = np.zeros((), dtype)
@@ -134,7 +133,7 @@ def _forget(out: Path, index: dict[str, Any], entries: Mapping[str, SceneEntry])
         return
     for name in gone:
         del index["scenes"][name]
-    write_text(out / _INDEX, dumps(index) + "\n")
+    write_text(out / _INDEX, signed_text(index))
     for name in gone:
         (out / f"{name}.bin").unlink(missing_ok=True)
 
@@ -142,16 +141,21 @@ def _forget(out: Path, index: dict[str, Any], entries: Mapping[str, SceneEntry])
 def _load_index(cache: Path) -> dict[str, Any]:
     path = Path(cache) / _INDEX
     try:
-        index = json.loads(path.read_text(encoding="utf-8"))
+        data = path.read_bytes()
     except OSError as err:
         raise DataError(
             f"{path}: cannot read the cache's index: {err}", hint="tofcapture pack DATASET"
         ) from err
-    except ValueError as err:
-        raise DataError(f"{path}: not JSON: {err}", hint=AGAIN) from err
-    if not isinstance(index, dict) or (index.get("format"), index.get("version")) != (FORMAT, VERSION):
+    index = parse_json(data, str(path), AGAIN)
+    if (index.get("format"), index.get("version")) != (FORMAT, VERSION):
         raise FormatError(f"{path}: expected {FORMAT} version {VERSION}", hint=AGAIN)
-    return index
+    return parse_signed(data, str(path), AGAIN)
+
+
+def is_cache(folder: Path) -> bool:
+    """Whether a folder says that it is a cache, damaged or not."""
+    path = folder / _INDEX
+    return path.is_file() and FORMAT.encode() in path.read_bytes()
 
 
 def open_cache(cache: Path, dataset: Path | None = None) -> dict[str, PackedScene]:

@@ -1,18 +1,18 @@
-"""List every problem of a view, a shard, a recording or a dataset; never raise on bad data."""
+"""List every problem of a view, a shard, a recording, a dataset or a cache; never raise on bad data."""
 
 from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import h5py
-
+from tofcapture.files.cache import is_cache
+from tofcapture.files.check_dataset import check_cache, check_dataset
 from tofcapture.files.check_file import Problem, check_file, guarded
-from tofcapture.files.manifest import SceneEntry, load_manifest, manifest_path, object_of
+from tofcapture.files.manifest import manifest_path
 from tofcapture.rig import load_rig
 
 __all__ = ["Problem", "check", "check_file"]
@@ -24,7 +24,7 @@ def check(path: Path, progress: Callable[[Path], None] | None = None) -> list[Pr
     Parameters
     ----------
     path
-        A view file, a shard, a recording's or a dataset's folder.
+        A view file, a shard, the folder of a recording, a dataset or a cache.
     progress
         Told each HDF5 file before it is read.
 
@@ -45,8 +45,11 @@ def _check_folder(path: Path, tell: Callable[[Path], None]) -> Iterator[Problem]
     if recording:
         yield from _check_recording(path, tell)
     if dataset:
-        yield from _check_dataset(path, tell)
-    if not recording and not dataset:
+        yield from check_dataset(path, tell)
+    if not recording and not dataset and is_cache(path):
+        tell(path)
+        yield from check_cache(path)
+    elif not recording and not dataset:
         yield Problem(path, "", "expected a recording (views/) or a dataset (manifest.json), found neither")
 
 
@@ -93,57 +96,3 @@ def _journal(recording: Path) -> tuple[dict[tuple[str, str], str], list[Problem]
             Problem(path, "", f"cannot be read: {err}", "tofcapture record rebuilds it from the sealed views")
         ]
     return {(scene, f"view-{index:03d}.h5"): sha for scene, index, sha in rows if sha}, []
-
-
-def _check_dataset(path: Path, tell: Callable[[Path], None]) -> Iterator[Problem]:
-    manifest = load_manifest(path)
-    if not manifest.scenes:
-        yield Problem(manifest_path(path), "scenes", "expected scenes, found none")
-    for name, entry in sorted(manifest.scenes.items()):
-        tell(path / entry.path)
-        problems = check_file(path / entry.path, entry.sha256)
-        yield from problems or _check_entry(path, name, entry)
-    yield from _leaks(path, manifest.scenes)
-    croissant = path / "croissant.json"
-    yield from guarded(croissant, lambda: _check_croissant(croissant, manifest.scenes))
-    listed = {(path / e.path).resolve() for e in manifest.scenes.values()}
-    for shard in sorted((path / "shards").glob("*.h5")):
-        if shard.resolve() not in listed:
-            yield Problem(
-                shard, "", "not in the manifest", "run build-dataset with its recording, or delete it"
-            )
-
-
-def _check_croissant(path: Path, scenes: Mapping[str, SceneEntry]) -> Iterator[Problem]:
-    """The Croissant description promises the same files as the manifest."""
-    files = _load_json(path)["distribution"]
-    promised = {f["contentUrl"]: f["sha256"] for f in files}
-    if promised != {e.path: e.sha256 for e in scenes.values()}:
-        yield Problem(
-            path, "distribution", "its files or digests differ from the manifest's", "run build-dataset again"
-        )
-
-
-def _check_entry(dataset: Path, name: str, entry: SceneEntry) -> Iterator[Problem]:
-    with h5py.File(dataset / entry.path, "r") as file:
-        if file.attrs["scene"] != name:
-            yield Problem(manifest_path(dataset), name, f"its shard holds the scene {file.attrs['scene']!r}")
-        views = file["tof/raw"].shape[0]
-        if views != entry.views:
-            yield Problem(
-                manifest_path(dataset), name, f"expected {entry.views} views, its shard holds {views}"
-            )
-
-
-def _leaks(dataset: Path, scenes: Mapping[str, SceneEntry]) -> Iterator[Problem]:
-    splits: dict[str, set[str]] = {}
-    for name, entry in scenes.items():
-        splits.setdefault(object_of(name), set()).add(entry.split)
-    for thing, where in sorted(splits.items()):
-        if len(where) > 1:
-            yield Problem(
-                manifest_path(dataset),
-                thing,
-                f"the object is in {' and '.join(sorted(where))}",
-                "run build-dataset again",
-            )

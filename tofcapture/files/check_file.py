@@ -20,10 +20,13 @@ from tofcapture.files import content
 from tofcapture.files.hdf import fetch, json_attr, text_attr
 from tofcapture.files.info import stereo_from, tof_from
 from tofcapture.files.layout import LAYOUTS, SHARD, VIEW, Field, Layout
-from tofcapture.files.seal import digest_path, sha256_of, stored_digest
+from tofcapture.files.seal import digest_path, digest_text, sha256_of, stored_digest
 from tofcapture.frames import TofInfo
 from tofcapture.rig import loads_rig
 
+_DIGEST_AGAIN = (
+    "restore it from a copy, or write it anew with sha256sum once the file itself is known to be right"
+)
 _AGAIN = "restore it from a copy, or delete it and run the same command again"
 
 
@@ -92,6 +95,10 @@ def _check_file(path: Path, sha256: str | None) -> Iterator[Problem]:
             "",
             f"expected its digest in {digest_path(path).name}",
             "copy NAME.sha256 along with the file",
+        )
+    elif digest_path(path).read_bytes() != digest_text(path, stored).encode():
+        yield Problem(
+            digest_path(path), "", "expected one line as sha256sum writes it, for this file", _DIGEST_AGAIN
         )
     damaged = False
     for source, promised in ((digest_path(path).name, stored), ("the manifest or journal", sha256)):
@@ -211,12 +218,18 @@ def _view_rules(file: h5py.File, info: TofInfo) -> Iterator[content.Finding]:
 
 
 def _shard_rules(file: h5py.File, info: TofInfo) -> Iterator[content.Finding]:
+    yield from content.plausible(file)
+    yield from content.distinct(file, "views/index")
     yield from content.rigid(file, "views/T_base_tof")
     yield from content.increasing(file, "tof/time_ns")
     yield from content.saturated_or_not(file, "tof/raw", info.saturation)
     for view in range(file["tof/raw"].shape[0]):
-        yield from content.positive(f"/tof/depth[{view}]", file["tof/depth"][view])
-        yield from content.positive(f"/gt/native_depth[{view}]", file["gt/native_depth"][view])
+        for name in ("tof/depth", "gt/native_depth"):
+            depth = file[name][view]
+            yield from content.positive(f"/{name}[{view}]", depth)
+            yield from content.near(f"/{name}[{view}]", depth)
+        yield from content.amplitude(f"/tof/confidence[{view}]", file["tof/confidence"][view])
+        yield from content.flagged(f"/tof/flags[{view}]", file["tof/flags"][view])
         for scale in (1, 2):
             yield from _projected_rules(file, view, scale, info)
 
@@ -224,6 +237,7 @@ def _shard_rules(file: h5py.File, info: TofInfo) -> Iterator[content.Finding]:
 def _projected_rules(file: h5py.File, view: int, scale: int, info: TofInfo) -> Iterator[content.Finding]:
     depth, normals, mask = (file[f"gt/{name}_{scale}x"][view] for name in ("depth", "normals", "mask"))
     yield from content.positive(f"/gt/depth_{scale}x[{view}]", depth)
+    yield from content.near(f"/gt/depth_{scale}x[{view}]", depth)
     yield from content.masked(f"/gt/mask_{scale}x[{view}]", depth, mask)
     yield from content.normals_obey(f"/gt/normals_{scale}x[{view}]", normals, np.isfinite(depth))
     yield from content.faces(f"/gt/normals_{scale}x[{view}]", normals, info.camera.scaled(scale).rays)

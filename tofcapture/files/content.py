@@ -10,13 +10,17 @@ from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError
 from tofcapture.files.hdf import Array
-from tofcapture.files.layout import MaskBit
+from tofcapture.files.layout import MaskBit, TofFlag
 from tofcapture.poses import check_transform
 
 Finding = tuple[str, str]
 
 _UNIT = 1e-3  # tolerance of a normal's length: float32 and then some
 _ALL_BITS = np.uint8(sum(MaskBit))
+_ALL_FLAGS = np.uint8(sum(TofFlag))
+FARTHEST = 30.0  # m; twice what 10 MHz measures without ambiguity, farther than any station or room
+REACH = 20.0  # m; from an arm's base to its camera
+CELSIUS = (-40.0, 125.0)  # what electronics survive
 
 
 def _count(bad: NDArray[np.bool_]) -> str:
@@ -60,6 +64,42 @@ def positive(where: str, depth: Array) -> Iterator[Finding]:
     bad = ~(np.isnan(depth) | (np.isfinite(depth) & (depth > 0)))
     if bad.any():
         yield where, f"expected positive depth or NaN, {_count(bad)} are neither"
+
+
+def near(where: str, depth: Array) -> Iterator[Finding]:
+    """No surface is farther than :data:`FARTHEST`."""
+    far = depth > FARTHEST  # NaN compares false
+    if far.any():
+        yield where, f"expected depth of at most {FARTHEST:g} m, {_count(far)} are farther"
+
+
+def amplitude(where: str, confidence: Array) -> Iterator[Finding]:
+    """An amplitude is a number from zero up, or NaN."""
+    bad = (confidence < 0) | np.isinf(confidence)
+    if bad.any():
+        yield where, f"expected amplitudes from zero up, {_count(bad)} are not"
+
+
+def flagged(where: str, flags: Array) -> Iterator[Finding]:
+    """No unknown flag is set."""
+    if (flags & ~_ALL_FLAGS).any():
+        yield where, f"expected the flags {[b.name for b in TofFlag]} only, others are set"
+
+
+def plausible(file: h5py.File) -> Iterator[Finding]:
+    """Temperatures that electronics survive, poses within an arm's reach."""
+    celsius = np.asarray(file["tof/celsius"][()])
+    if ((celsius < CELSIUS[0]) | (celsius > CELSIUS[1])).any():
+        yield "/tof/celsius", f"expected {CELSIUS[0]:g} to {CELSIUS[1]:g} degC or NaN, some are not"
+    if (np.abs(np.asarray(file["views/T_base_tof"][()])[..., :3, 3]) > REACH).any():
+        yield "/views/T_base_tof", f"expected a camera within {REACH:g} m of the base, it is farther away"
+
+
+def distinct(file: h5py.File, name: str) -> Iterator[Finding]:
+    """Every view of the recording is there once."""
+    index = np.asarray(file[name][()])
+    if len(np.unique(index)) != len(index) or (index < 0).any():
+        yield f"/{name}", f"expected distinct numbers from 0 up, got {index.tolist()}"
 
 
 def masked(where: str, depth: Array, mask: Array) -> Iterator[Finding]:

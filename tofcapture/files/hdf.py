@@ -18,7 +18,12 @@ Array = NDArray[Any]
 
 
 def create(
-    file: h5py.File, field: Field, shape: tuple[int, ...], dtype: str | np.dtype[Any], gzip: int
+    file: h5py.File,
+    field: Field,
+    shape: tuple[int, ...],
+    dtype: str | np.dtype[Any],
+    gzip: int,
+    chunks: tuple[int, ...] | None = None,
 ) -> h5py.Dataset:
     """Create a field's dataset; the same calls give the same bytes (no time stamps).
 
@@ -32,14 +37,15 @@ def create(
         The dtype must be one that the field allows.
     gzip
         Level 1 to 9 for chunked fields.
+    chunks
+        Other chunks than one per entry of the field's leading dims.
     """
     if np.dtype(dtype).name not in field.dtypes:
         raise FormatError(f"/{field.path}: expected {' or '.join(field.dtypes)}, got {np.dtype(dtype).name}")
     storage: dict[str, Any] = {}
     if field.chunk is not None:
-        chunks = (1,) * field.chunk + shape[field.chunk :]
         storage = {
-            "chunks": chunks,
+            "chunks": chunks or (1,) * field.chunk + shape[field.chunk :],
             "shuffle": True,
             "compression": "gzip",
             "compression_opts": gzip,
@@ -132,8 +138,8 @@ def json_attr(file: h5py.File, name: str, path: Path) -> Any:
         raise FormatError(f"{path}: attribute {name!r} is not JSON: {err}") from err
 
 
-def fetch(file: h5py.File, field: Field, path: Path) -> Array:
-    """Read a whole dataset.
+def fetch(file: h5py.File, field: Field, path: Path, part: Any = ()) -> Array:
+    """Read a dataset, whole or a part of it.
 
     Raises
     ------
@@ -150,6 +156,6 @@ def fetch(file: h5py.File, field: Field, path: Path) -> Array:
             f"{path}: /{field.path}: expected {' or '.join(field.dtypes)}, got {dataset.dtype.name}"
         )
     try:
-        return np.asarray(dataset[()])
+        return np.asarray(dataset[part])
     except (OSError, RuntimeError, ValueError) as err:
         raise DataError(f"{path}: /{field.path} is damaged: {err}", hint=f"tofcapture check {path}") from err

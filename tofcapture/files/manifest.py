@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -12,8 +11,13 @@ from typing import Any
 from tofcapture.errors import DataError, FormatError
 from tofcapture.files.layout import SPLITS
 from tofcapture.files.seal import write_text
+from tofcapture.files.signed import KEY, parse_json, parse_signed, signed_text
 
-FORMAT, VERSION = "tofcapture-manifest", 1
+FORMAT, VERSION = "tofcapture-manifest", 2
+UNSIGNED = (
+    1  # version that did not carry its own digest; readers still take it, `tofcapture migrate` signs it
+)
+_AGAIN = "run build-dataset again, or restore it from a copy"
 COMBINATIONS = ("random",)  # every number is another combination of objects
 
 
@@ -47,6 +51,8 @@ class SceneEntry:
     def __post_init__(self) -> None:
         if self.split not in SPLITS:
             raise FormatError(f"expected a split of {', '.join(SPLITS)}, got {self.split!r}")
+        if not (isinstance(self.path, str) and isinstance(self.sha256, str) and type(self.views) is int):
+            raise FormatError(f"expected path and sha256 as text, views as a number, got {self}")
         if Path(self.path).is_absolute() or ".." in Path(self.path).parts:
             raise FormatError(f"expected a path inside the dataset, got {self.path!r}")
 
@@ -71,6 +77,13 @@ def manifest_path(dataset: Path) -> Path:
 
 def write_manifest(dataset: Path, manifest: Manifest) -> Path:
     """Write ``DATASET/manifest.json`` atomically; same content, same bytes."""
+    path = manifest_path(dataset)
+    write_text(path, manifest_text(manifest))
+    return path
+
+
+def manifest_text(manifest: Manifest) -> str:
+    """Text of ``manifest.json``, which carries its own SHA-256."""
     table = {
         "format": FORMAT,
         "version": VERSION,
@@ -78,9 +91,7 @@ def write_manifest(dataset: Path, manifest: Manifest) -> Path:
         "config": dict(manifest.config),
         "versions": dict(manifest.versions),
     }
-    path = manifest_path(dataset)
-    write_text(path, json.dumps(table, indent=1, sort_keys=True) + "\n")
-    return path
+    return signed_text(table)
 
 
 def load_manifest(dataset: Path) -> Manifest:
@@ -89,26 +100,32 @@ def load_manifest(dataset: Path) -> Manifest:
     Raises
     ------
     DataError
-        When it is missing or not JSON.
+        When it is missing, not JSON, or changed after it was written.
     FormatError
         When it is of another format or version, or an entry is incomplete.
     """
     path = manifest_path(dataset)
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        data = path.read_bytes()
     except OSError as err:
         raise DataError(
             f"{path}: cannot read the dataset's manifest: {err}",
             hint="tofcapture build-dataset RECORDING --out DIR",
         ) from err
-    except ValueError as err:
-        raise DataError(f"{path}: not JSON: {err}", hint="run build-dataset again") from err
+    table = parse_json(data, str(path), _AGAIN)
+    if table.get("format") != FORMAT or table.get("version") not in (VERSION, UNSIGNED):
+        raise FormatError(f"{path}: expected {FORMAT} version {VERSION}", hint=_AGAIN)
+    if table["version"] == VERSION:
+        parse_signed(data, str(path), _AGAIN)
     return _parse(table, path)
 
 
-def _parse(table: Any, path: Path) -> Manifest:
-    if not isinstance(table, dict) or (table.get("format"), table.get("version")) != (FORMAT, VERSION):
-        raise FormatError(f"{path}: expected {FORMAT} version {VERSION}")
+def _parse(table: dict[str, Any], path: Path) -> Manifest:
+    known = {"format", "version", "scenes", "config", "versions"} | (
+        {KEY} if table["version"] == VERSION else set()
+    )
+    if table.keys() != known:
+        raise FormatError(f"{path}: expected the parts {sorted(known)}, got {sorted(table)}", hint=_AGAIN)
     try:
         scenes = {str(name): SceneEntry(**entry) for name, entry in table["scenes"].items()}
         return Manifest(scenes, table["config"], table["versions"])

@@ -19,7 +19,7 @@ import numpy as np
 from tofcapture.errors import DataError
 from tofcapture.files.hdf import Array, create, dumps, open_checked
 from tofcapture.files.layout import SHARD, SHARD_1, TofFlag
-from tofcapture.files.manifest import SceneEntry, load_manifest, manifest_path, write_manifest
+from tofcapture.files.manifest import SceneEntry, load_manifest, manifest_path, manifest_text, write_manifest
 from tofcapture.files.seal import (
     PARTIAL,
     partial_path,
@@ -94,6 +94,8 @@ def migrate(path: Path, progress: Progress | None = None) -> list[Migration]:
                 manifest, scenes={**manifest.scenes, name: replace(entry, sha256=found.sha256)}
             )
             write_manifest(path, manifest)
+    if manifest_path(path).read_text(encoding="utf-8") != manifest_text(manifest):
+        write_manifest(path, manifest)  # it was of the version that did not carry its own digest
     _describe(path / "croissant.json", dict(manifest.scenes))
     return done
 
@@ -191,6 +193,7 @@ def _describe(path: Path, scenes: dict[str, SceneEntry]) -> None:
     text = path.read_text(encoding="utf-8")
     table = json.loads(text)
     digests = {e.path: e.sha256 for e in scenes.values()}
+    digests["manifest.json"] = sha256_of(manifest_path(path.parent))
     for entry in table.get("distribution", ()):
         entry["sha256"] = digests.get(entry.get("contentUrl"), entry.get("sha256"))
     old, new = (f"({SHARD.format} {version})" for version in (SHARD_1.version, SHARD.version))

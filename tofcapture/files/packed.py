@@ -13,6 +13,7 @@ from tofcapture.camera import Camera
 from tofcapture.errors import DataError
 from tofcapture.files.hdf import Array
 from tofcapture.files.info import tof_from
+from tofcapture.files.seal import remember, remembered, verify
 from tofcapture.files.shard import GroundTruth, Scale, ShardReader
 from tofcapture.frames import TofInfo
 
@@ -35,7 +36,7 @@ class PackedScene:
     Raises
     ------
     DataError
-        On first use, when the file is missing or not of the size that the index says.
+        On first use, when the file is missing or not the one that was packed: it is hashed once per process.
     """
 
     def __init__(self, folder: Path, scene: str, entry: Mapping[str, Any]) -> None:
@@ -45,7 +46,12 @@ class PackedScene:
         self._map: Array | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"path": self.path, "scene": self.scene, "_entry": self._entry, "_map": None}
+        fresh: dict[str, Any] = {"path": self.path, "scene": self.scene, "_entry": self._entry, "_map": None}
+        return {**fresh, "known": remembered(self.path)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        remember(state["path"], state.pop("known"))
+        self.__dict__.update(state)
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
@@ -83,6 +89,7 @@ class PackedScene:
                     f"{self.path}: expected {expected} bytes, {'no file' if found is None else found} found",
                     hint=AGAIN,
                 )
+            verify(self.path, self._entry["sha256"])
             self._map = np.memmap(self.path, self.dtype, mode="r")
         return self._map
 

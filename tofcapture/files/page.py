@@ -23,23 +23,27 @@ fsynced, made read-only and renamed; the file `NAME.sha256` beside it holds the 
 _OTHERS = """\
 ## `DATASET/manifest.json`
 
-`{"format": "tofcapture-manifest", "version": 1, "scenes": {NAME: {"path", "sha256", "views", "split"}}, "config": {...},
-"versions": {...}}`; `path` is relative to the dataset, `split` is train, val or test. Scenes of one object (the name up to a
-trailing `-<digits>`) are always in the same split.
+`{"format": "tofcapture-manifest", "version": 2, "scenes": {NAME: {"path", "sha256", "views", "split"}}, "config": {...},
+"versions": {...}, "sha256": ...}`; `path` is relative to the dataset, `split` is train, val or test. Scenes of one object (the
+name up to a trailing `-<digits>`) are always in the same split. The last entry is the SHA-256 of the file's own text without that
+entry, keys sorted, indented by one: a changed character is refused, so the file is not edited by hand. Version 1 did not have
+it; readers take it, `tofcapture migrate` adds it.
 
 ## Cache `CACHE/index.json`, `CACHE/<scene>.bin`
 
 One split of a dataset, packed for training: `tofcapture.files.cache.pack`. A `.bin` file is one record per view, without a
 header, of `{"raw": F x K x H x W, "celsius": F, "depth", "normals", "mask"}`, ground truth at 2x; `index.json` holds
 `"format": "tofcapture-cache"`, `"version": 1`, `"split"` and per scene the record's `dtype` (as numpy describes it), `views`,
-`sha256` of the file, `shard_sha256` of the shard that it was packed from, `rig`, `tof_info`. A cache whose shards have changed is
-refused. `numpy.memmap(path, dtype)` opens it.
+`sha256` of the file, `shard_sha256` of the shard that it was packed from, `tof_info`; its own digest as in the manifest. A cache
+whose shards have changed is refused. `numpy.memmap(path, dtype)` opens it.
 
 ## `rig.toml`
 
 `format = "tofcapture-rig"`, `version = 1`, `units = "m"`; tables `[tof]` (width, height, fx, fy, cx, cy, illuminator) and
 `[stereo]` (width, height, fx, fy, cx, cy); `T_tof_stereo` and `T_flange_tof` as 4 x 4 lists; any number of `[[range_error]]`
-(modulation_hz, offset, scale, harmonics as `[order, cosine, sine]`, per_pixel_radius, per_kelvin, reference_celsius).
+(modulation_hz, offset, scale, harmonics as `[order, cosine, sine]`, per_pixel_radius, per_kelvin, reference_celsius; where there
+are any, image as `[power of x, power of y, metres]` with x and y from -1 to 1 across the image, and per_inverse_amplitude). `[tof]`
+has `distortion` (k1, k2, p1, p2, k3 as OpenCV has them) unless its images are a pinhole's; a stereo grid has none.
 """
 
 

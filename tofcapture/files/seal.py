@@ -8,11 +8,20 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from tofcapture.errors import DataError
 
 PARTIAL = ".partial"
+_SETTLED = 2.0  # s; a file changed since then may change again within one tick of the file system's clock
+_AGAIN = "restore it from a copy, or delete it and run the same command again"
+
+Identity = tuple[int, ...]
+_digests: dict[str, tuple[Identity, str]] = {}  # by absolute path, what this process has hashed
 
 
 def partial_path(path: Path) -> Path:
@@ -32,6 +41,60 @@ def sha256_of(path: Path) -> str:
     """SHA-256 of a file's bytes, hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _identity(path: Path) -> Identity:
+    """Device, inode, size and both times: a file that was written to since has another one."""
+    s = path.stat()
+    return s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns
+
+
+def digest_once(path: Path) -> str:
+    """SHA-256 of a file's bytes; a file that this process has hashed and nobody touched since is not read again."""
+    name, before = str(path.absolute()), _identity(path)
+    if (known := _digests.get(name)) is not None and known[0] == before:
+        return known[1]
+    digest = sha256_of(path)
+    if _identity(path) == before and time.time() - max(before[-2:]) / 1e9 > _SETTLED:
+        _digests[name] = before, digest
+    return digest
+
+
+def remembered(path: Path) -> tuple[Identity, str] | None:
+    """What :func:`digest_once` knows of a file, for a process that this one starts."""
+    return _digests.get(str(path.absolute()))
+
+
+def remember(path: Path, known: tuple[Identity, str] | None) -> None:
+    """Take over what another process of this machine :func:`remembered`."""
+    if known is not None:
+        _digests.setdefault(str(path.absolute()), known)
+
+
+def verify(path: Path, promised: str | None = None) -> None:
+    """Make sure, once per process, that a file is the one that was sealed.
+
+    Parameters
+    ----------
+    path
+        The file.
+    promised
+        Its digest in a manifest; ``None``: the one stored beside it counts. Where there is neither there is nothing to compare
+        with.
+
+    Raises
+    ------
+    DataError
+        Its bytes are not those that were sealed, or the stored digest is damaged.
+    """
+    if promised is None and not digest_path(path).exists():
+        return
+    expected, found = promised or stored_digest(path), digest_once(path)
+    if expected != found:
+        raise DataError(
+            f"{path}: expected sha256 {str(expected)[:12]}..., got {found[:12]}...: changed after it was sealed",
+            hint=_AGAIN,
+        )
 
 
 def stored_digest(path: Path) -> str | None:
@@ -57,15 +120,20 @@ def sealed_digest(path: Path) -> str:
     """
     stored = stored_digest(path)
     try:
-        found = sha256_of(path)
+        found = digest_once(path)
     except OSError as err:
         raise DataError(f"{path}: cannot be read: {err}") from err
     if stored not in (None, found):
         raise DataError(
             f"{path}: expected sha256 {str(stored)[:12]}..., got {found[:12]}...: changed after it was sealed",
-            hint="restore it from a copy, or delete it and run the same command again",
+            hint=_AGAIN,
         )
     return found
+
+
+def digest_text(path: Path, digest: str) -> str:
+    """Content of :func:`digest_path`, as ``sha256sum -c`` reads it."""
+    return f"{digest}  {path.name}\n"
 
 
 def fsync(path: Path) -> None:
@@ -77,13 +145,24 @@ def fsync(path: Path) -> None:
         os.close(handle)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Replace a text file atomically: readers see the old one or the new one, also after a power cut."""
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """Write a file that takes the place of ``path`` at the end: others see the old one or the new one, also after a power cut."""
     partial = partial_path(path)
-    partial.write_text(text, encoding="utf-8")
-    fsync(partial)
-    partial.replace(path)
-    fsync(path.parent)
+    try:
+        with partial.open("wb") as file:
+            yield file
+        fsync(partial)
+        partial.replace(path)
+        fsync(path.parent)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replace a text file atomically, as :func:`replacing` does."""
+    with replacing(path) as file:
+        file.write(text.encode())
 
 
 def seal(partial: Path, path: Path) -> str:
@@ -98,7 +177,7 @@ def seal(partial: Path, path: Path) -> str:
     digest = sha256_of(partial)
     fsync(partial)
     partial.chmod(0o444)
-    write_text(digest_path(path), f"{digest}  {path.name}\n")
+    write_text(digest_path(path), digest_text(path, digest))
     partial.replace(path)
     fsync(path.parent)
     return digest

@@ -11,8 +11,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -26,101 +24,18 @@ from tofcapture.camera import Camera
 from tofcapture.errors import DataError, FormatError
 from tofcapture.files.hdf import Array, attr, json_attr, open_checked, text_attr
 from tofcapture.files.info import stereo_from, tof_from
-from tofcapture.files.layout import SHARD, SHARD_1, TofFlag
+from tofcapture.files.layout import SHARD, SHARD_1
+from tofcapture.files.maps import ExactMaps, Float32, GroundTruth, Sample, TofMaps
+from tofcapture.files.seal import remember, remembered, verify
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.ops.normals import normals_from_depth
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig, loads_rig
 
-Float32 = NDArray[np.float32]
+__all__ = ["ExactMaps", "GroundTruth", "Sample", "Scale", "ShardReader", "TofMaps"]
+
 Scale = Literal[1, 2]
-
-
-@dataclass(frozen=True)
-class GroundTruth:
-    """Stereo ground truth on the ToF plane at one scale.
-
-    Attributes
-    ----------
-    depth
-        (sH, sW) float32, metres; NaN exactly where the mask says ``NOT_HIT``.
-    normals
-        (sH, sW, 3) float32, ToF frame, unit, facing the camera; NaN where depth is.
-    mask
-        (sH, sW) uint8, bits of :class:`tofcapture.files.layout.MaskBit`; 0 is good ground truth.
-    """
-
-    depth: Float32
-    normals: Float32
-    mask: NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class TofMaps:
-    """The sensor's own answer for a burst, averaged as I and Q.
-
-    Attributes
-    ----------
-    depth
-        (H, W) float32, metres; NaN: none.
-    confidence
-        (H, W) float32, amplitude of the highest frequency, raw units.
-    flags
-        (H, W) uint8, bits of :class:`tofcapture.flags.TofFlag`; 0 is a good pixel. An array of bool says which are saturated.
-    """
-
-    depth: Float32
-    confidence: Float32
-    flags: NDArray[np.uint8]
-
-    @property
-    def saturated(self) -> NDArray[np.bool_]:
-        """(H, W) bool, a tap of a frame reached saturation."""
-        out: NDArray[np.bool_] = (self.flags & np.uint8(TofFlag.SATURATED)) != 0
-        return out
-
-
-@dataclass(frozen=True)
-class ExactMaps:
-    """What only a simulator knows, on the ToF plane at 2x: depth (2H, 2W), metres, and normals (2H, 2W, 3)."""
-
-    depth: Float32
-    normals: Float32
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One view of a shard: what :func:`tofcapture.dataset.sample.make_sample` makes and the writer stacks.
-
-    Attributes
-    ----------
-    index
-        Number of the view in its recording.
-    raw
-        (F, K, H, W) phase images as the sensor gave them.
-    celsius, time_ns
-        (F,).
-    tof
-        Decoded burst.
-    native_depth
-        (SH, SW) float32, cropped and denoised stereo depth, stereo frame; NaN: none.
-    ground_truth
-        By scale, 1 and 2.
-    T_base_tof
-        (4, 4), from the measured joints.
-    truth
-        Only from a simulator.
-    """
-
-    index: int
-    raw: Array
-    celsius: Float64
-    time_ns: NDArray[np.int64]
-    tof: TofMaps
-    native_depth: Float32
-    ground_truth: Mapping[int, GroundTruth]
-    T_base_tof: Float64
-    truth: ExactMaps | None = None
+_CHECK = "tofcapture check says what is damaged"
 
 
 class ShardReader:
@@ -130,6 +45,9 @@ class ShardReader:
     ----------
     path
         Of the shard.
+    sha256
+        Its digest in the manifest; ``None``: the one beside it counts, if there is one. On first use the whole file is hashed,
+        once per process and for the processes that it hands readers to (docs/decisions/0016).
 
     Raises
     ------
@@ -137,14 +55,26 @@ class ShardReader:
         On first use, when the file is missing, damaged, foreign or of another version.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, sha256: str | None = None) -> None:
         self.path = Path(path)
+        self._sha256 = sha256
         self._file: h5py.File | None = None
         self._datasets: dict[str, h5py.Dataset] = {}
         self._pid = -1
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"path": self.path, "_file": None, "_datasets": {}, "_pid": -1}
+        fresh: dict[str, Any] = {
+            "path": self.path,
+            "_sha256": self._sha256,
+            "_file": None,
+            "_datasets": {},
+            "_pid": -1,
+        }
+        return {**fresh, "known": remembered(self.path)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        remember(state["path"], state.pop("known"))
+        self.__dict__.update(state)
 
     def __enter__(self) -> Self:
         return self
@@ -162,6 +92,8 @@ class ShardReader:
 
     def _open(self) -> h5py.File:
         if self._file is None or self._pid != os.getpid():
+            if self.path.is_file():
+                verify(self.path, self._sha256)
             # A handle that crossed a fork shares its file offset with the parent: leave it alone and open anew.
             self._file, self._datasets, self._pid = open_checked(self.path, SHARD, SHARD_1), {}, os.getpid()
         return self._file
@@ -169,7 +101,10 @@ class ShardReader:
     def _dataset(self, name: str) -> h5py.Dataset:
         file = self._open()
         if name not in self._datasets:
-            found = file.get(name)
+            try:
+                found = file.get(name)
+            except (OSError, RuntimeError, ValueError, KeyError) as err:
+                raise DataError(f"{self.path}: /{name} cannot be opened: {err}", hint=_CHECK) from err
             if not isinstance(found, h5py.Dataset):
                 raise FormatError(f"{self.path}: expected the dataset /{name}, found none")
             self._datasets[name] = found
@@ -184,7 +119,7 @@ class ShardReader:
             raise DataError(f"{self.path}: /{name} has shape {dataset.shape}, asked for {index}")
         try:
             return np.asarray(dataset[index])
-        except (OSError, RuntimeError) as err:
+        except (OSError, RuntimeError, ValueError) as err:
             where = f"/{name}{list(index)}"
             raise DataError(
                 f"{self.path}: {where} is damaged: {err}", hint=f"tofcapture check {self.path}"
@@ -242,6 +177,10 @@ class ShardReader:
     def celsius(self, view: int, frame: int) -> float:
         """Sensor temperature of one frame; NaN: not told."""
         return float(self._row("tof/celsius", view, frame))
+
+    def time_ns(self, view: int, frame: int) -> int:
+        """When a frame was taken, nanoseconds of the recording's monotonic clock."""
+        return int(self._row("tof/time_ns", view, frame))
 
     def tof(self, view: int) -> TofMaps:
         """Decoded burst."""

@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -20,15 +19,17 @@ import h5py
 import numpy as np
 
 from tofcapture.errors import DataError, FormatError
+from tofcapture.files.chunks import ChunkWriter
 from tofcapture.files.hdf import Array, create, open_checked, write_attrs
 from tofcapture.files.info import stereo_table, tof_table
-from tofcapture.files.layout import SHARD
+from tofcapture.files.layout import SHARD, VIEW
 from tofcapture.files.seal import partial_path, seal
 from tofcapture.files.shard import Sample
 from tofcapture.files.view import check_scene_name
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.rig import Rig, dumps_rig
 
+_RAW = "tof/raw"
 COMPRESSION = 1  # half a per cent more bytes than 4, written and read a third faster (docs/decisions/0012)
 
 
@@ -72,7 +73,8 @@ class ShardWriter:
         self._scene = check_scene_name(scene)
         self._rig, self._tof, self._stereo = rig, tof_info, stereo_info
         self._views, self._added = views, 0
-        self._digests: dict[str, Any] = {}
+        self._names: set[str] = set()
+        self._chunks = ChunkWriter()
         self._partial = partial_path(self._path)
         self._file: h5py.File | None = None
 
@@ -94,12 +96,19 @@ class ShardWriter:
         for field in SHARD:
             if field.path in rows:
                 create(file, field, field.shape(sizes), rows[field.path].dtype, COMPRESSION)
-                self._digests[field.path] = hashlib.sha256()
+                self._names.add(field.path)
             elif not field.optional:
                 raise FormatError(f"sample: expected /{field.path}, got none")
 
-    def add(self, sample: Sample) -> None:
+    def add(self, sample: Sample, view_file: Path | None = None) -> None:
         """Append one sample.
+
+        Parameters
+        ----------
+        sample
+            What to append.
+        view_file
+            View that it was made of; its packed phase images are copied as they are.
 
         Raises
         ------
@@ -111,10 +120,8 @@ class ShardWriter:
         rows = sample_arrays(sample)
         if not self._added:
             self._create(self._file, rows)
-        if rows.keys() != self._digests.keys():
-            raise FormatError(
-                f"{self._path}: samples disagree on {sorted(rows.keys() ^ self._digests.keys())}"
-            )
+        if rows.keys() != self._names:
+            raise FormatError(f"{self._path}: samples disagree on {sorted(rows.keys() ^ self._names)}")
         for name, row in rows.items():
             dataset = self._file[name]
             if row.shape != dataset.shape[1:] or row.dtype != dataset.dtype:
@@ -122,10 +129,14 @@ class ShardWriter:
                 raise FormatError(
                     f"/{name}: expected {dataset.dtype} {dataset.shape[1:]} per view, got {got}"
                 )
-            dataset[self._added] = row
+            if name != _RAW or view_file is None or not self._copy(dataset, row, view_file):
+                self._chunks.put(dataset, row, self._added)
             dataset.flush()  # now, not when the last handle goes, which a debugger or profiler may hold: the same bytes
-            self._digests[name].update(row.tobytes())
         self._added += 1
+
+    def _copy(self, dataset: h5py.Dataset, row: Array, view_file: Path) -> bool:
+        with open_checked(view_file, VIEW) as file:
+            return self._chunks.copy(dataset, row, self._added, file[_RAW])
 
     def seal(self, provenance: Mapping[str, Any]) -> str:
         """Write the attributes, verify every row, make the shard permanent.
@@ -158,9 +169,6 @@ class ShardWriter:
 
     def _verify(self) -> None:
         with open_checked(self._partial, SHARD) as file:
-            for name, digest in self._digests.items():
-                found = hashlib.sha256()
-                for row in file[name]:
-                    found.update(np.asarray(row).tobytes())
-                if found.digest() != digest.digest():
-                    raise DataError(f"{self._path}: /{name} read back differs from what was written")
+            name = self._chunks.differing(file)
+            if name is not None:
+                raise DataError(f"{self._path}: {name} read back differs from what was written")

@@ -9,13 +9,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError, DataError, FormatError, TofError
+from tofcapture.files.chunks import ChunkWriter
 from tofcapture.files.hdf import Array, attr, create, fetch, json_attr, open_checked, text_attr, write_attrs
 from tofcapture.files.info import stereo_from, stereo_table, tof_from, tof_table
 from tofcapture.files.layout import VIEW, Field
@@ -24,6 +28,7 @@ from tofcapture.frames import ArmState, StereoFrame, TofBurst, Truth, View
 from tofcapture.rig import dumps_rig, loads_rig
 
 _GZIP = 1  # a view is written while the arm waits
+_POINTS = "stereo/points"
 _SCENE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
@@ -75,7 +80,9 @@ def _sizes(view: View) -> dict[str, int]:
 def _put(file: h5py.File, field: Field, data: Array, sizes: dict[str, int]) -> None:
     if data.shape != field.shape(sizes):
         raise FormatError(f"/{field.path}: expected shape {field.shape(sizes)}, got {data.shape}")
-    create(file, field, data.shape, data.dtype, _GZIP)[...] = data
+    # One coordinate per chunk: x, y and z each pack better alone, and depth is read without the others.
+    chunks = (*data.shape[:-1], 1) if field.path == _POINTS else None
+    ChunkWriter().put(create(file, field, data.shape, data.dtype, _GZIP, chunks), data)
 
 
 def _verify(path: Path, arrays: dict[str, Array]) -> None:
@@ -145,16 +152,44 @@ def read_view(path: Path) -> View:
         Another format or version, a dataset missing, or shapes that contradict each other.
     """
     path = Path(path)
+    with _opened(path) as file:
+        return _read(file, path, fetch(file, VIEW[_POINTS], path))
+
+
+def read_depth_view(path: Path) -> tuple[View, NDArray[np.float32]]:
+    """Read a view without x and y of its point map, which are two thirds of the work.
+
+    Returns
+    -------
+    view
+        As :func:`read_view`, but every point of the map is NaN.
+    depth
+        (SH, SW) z of the map, stereo frame, metres.
+
+    Raises
+    ------
+    DataError, FormatError
+        As :func:`read_view`.
+    """
+    path = Path(path)
+    with _opened(path) as file:
+        depth = fetch(file, VIEW[_POINTS], path, np.s_[..., 2])
+        return _read(file, path, np.broadcast_to(np.float32(np.nan), (*depth.shape, 3))), depth
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
+    """Open a view; errors from inside name it."""
     with open_checked(path, VIEW) as file:
         try:
-            return _read(file, path)
+            yield file
         except DataError as err:
             raise err if str(path) in err.message else type(err)(f"{path}: {err.message}", err.hint) from err
         except TofError as err:
             raise FormatError(f"{path}: {err.message}", hint=f"tofcapture check {path}") from err
 
 
-def _read(file: h5py.File, path: Path) -> View:
+def _read(file: h5py.File, path: Path, points: NDArray[np.float32]) -> View:
     def get(name: str) -> Array:
         return fetch(file, VIEW[name], path)
 
@@ -169,7 +204,7 @@ def _read(file: h5py.File, path: Path) -> View:
         scene=text_attr(file, "scene", path),
         index=int(attr(file, "index", path)),
         tof=TofBurst(get("tof/raw"), get("tof/time_ns"), get("tof/celsius"), tof_info),
-        stereo=StereoFrame(get("stereo/points"), int(get("stereo/time_ns")), stereo_info),
+        stereo=StereoFrame(points, int(get("stereo/time_ns")), stereo_info),
         arm_before=arm("before"),
         arm_after=arm("after"),
         rig=loads_rig(text_attr(file, "rig", path), f"{path}: rig"),

@@ -1,0 +1,67 @@
+"""The card says what the data tell; the Croissant description is valid JSON-LD of the same files."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.test_files_shard import write
+from tofcapture.dataset.card import write_card
+from tofcapture.dataset.croissant import CONTEXT
+from tofcapture.files.check import check
+from tofcapture.files.manifest import Manifest, SceneEntry, manifest_path, write_manifest
+from tofcapture.files.seal import sha256_of
+
+SECTIONS = ("Motivation", "Composition", "Collection", "Preprocessing", "Uses", "Distribution", "Maintenance")
+
+
+def make(folder, scenes=("box", "mug", "gear-2"), **kwargs):
+    """A dataset of random arrays with card and description."""
+    entries = {}
+    for i, scene in enumerate(scenes):
+        digest = write(folder / f"shards/{scene}.h5", (10 * i, 10 * i + 1), scene, **kwargs)
+        entries[scene] = SceneEntry(f"shards/{scene}.h5", digest, 2, "test" if i == 0 else "train")
+    manifest = Manifest(entries, {"far": 2.0}, {"tofcapture": "0"})
+    write_manifest(folder, manifest)
+    write_card(folder, manifest, None)
+    return folder
+
+
+def test_the_card_is_a_datasheet(tmp_path):
+    """Every section, the counts, the manifest's digest; nothing left to fill in."""
+    text = (make(tmp_path / "first") / "README.md").read_text(encoding="utf-8")
+    assert [s for s in SECTIONS if f"\n## {s}\n" not in text] == []
+    assert "6 views of 3 scenes, 3 ToF frames each" in text
+    assert "| train | 2 | 4 |" in text
+    assert sha256_of(manifest_path(tmp_path / "first")) in text
+    assert "far = 2.0" in text
+    assert "Simulated" in text
+    assert "{" not in text.replace('ShardReader("shards/box.h5")', "")
+    measured = make(tmp_path / "second", exact=False) / "README.md"
+    assert "Simulated" not in measured.read_text(encoding="utf-8")
+
+
+def test_the_description_holds_the_manifest_and_every_shard(tmp_path):
+    """Digests are those of the files; scenes and splits are rows of its record set; check finds nothing amiss in it."""
+    folder = make(tmp_path / "data")
+    table = json.loads((folder / "croissant.json").read_text(encoding="utf-8"))
+    for entry in table["distribution"]:
+        assert sha256_of(folder / entry["contentUrl"]) == entry["sha256"]
+    assert {f["contentUrl"] for f in table["distribution"]} == {
+        "manifest.json",
+        *(f"shards/{s}.h5" for s in ("box", "mug", "gear-2")),
+    }
+    rows = {r["scenes/name"]: r["scenes/split"] for r in table["recordSet"][0]["data"]}
+    assert rows == {"box": "test", "gear-2": "train", "mug": "train"}
+    assert table["@context"] == CONTEXT
+    assert not [p for p in check(folder) if p.path.name == "croissant.json"]
+
+
+def test_croissants_own_library_takes_it(tmp_path):
+    """mlcroissant finds no error, and reads the scenes back."""
+    mlc = pytest.importorskip("mlcroissant", reason="mlcroissant is not installed")
+    dataset = mlc.Dataset(make(tmp_path / "data") / "croissant.json")
+    assert not dataset.metadata.ctx.issues.errors
+    names = {r["scenes/name"] for r in dataset.records("scenes")}
+    assert names == {"box", "mug", "gear-2"}

@@ -1,0 +1,282 @@
+"""What a dataset holds, in numbers: distributions by split, mask and flag bits, views that stand out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.files.layout import SPLITS, MaskBit, TofFlag
+from tofcapture.files.manifest import SceneEntry, load_manifest, manifest_path
+from tofcapture.files.seal import sha256_of
+from tofcapture.files.shard import ShardReader
+
+Array = NDArray[Any]
+BINS = 400
+STANDS_OUT = 6.0  # robust standard deviations of a view's number from the median of all views
+FEWEST = 8  # views below which nothing can stand out
+_WORST = 1e3  # deviations of a view that has no good pixel at all
+_FLOOR = {  # of the deviation, so that views that are all but equal do not make a hair stand out
+    "gt_depth": 0.01,
+    "tof_depth": 0.01,
+    "tof_minus_gt": 0.001,
+    "amplitude": 1.0,
+    "incidence": 1.0,
+    "celsius": 0.5,
+    "good_share": 0.02,
+    "flagged_share": 0.01,
+}
+_PER_MAD = 1.4826  # standard deviations of a normal distribution per median absolute deviation
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What is counted: name, unit, the histogram's range, and whether its bins grow by a constant factor."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    log: bool = False
+
+    @property
+    def edges(self) -> NDArray[np.float64]:
+        """(BINS + 1,) edges of the bins."""
+        space = np.geomspace if self.log else np.linspace
+        return np.asarray(space(self.low, self.high, BINS + 1), dtype=np.float64)
+
+
+QUANTITIES = (
+    Quantity("gt_depth", "m", 0.0, 10.0),
+    Quantity("tof_depth", "m", 0.0, 10.0),
+    Quantity("tof_minus_gt", "m", -0.1, 0.1),
+    Quantity("amplitude", "DN", 0.1, 1e5, log=True),
+    Quantity("incidence", "deg", 0.0, 90.0),
+    Quantity("celsius", "degC", -40.0, 125.0),
+)
+
+
+@dataclass
+class Tally:
+    """Counts of one quantity.
+
+    Attributes
+    ----------
+    counts
+        (BINS,) values by bin; those beyond the range are in the outermost.
+    low, high
+        Smallest and largest value.
+    """
+
+    quantity: Quantity
+    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(BINS, np.int64))
+    low: float = np.inf
+    high: float = -np.inf
+
+    def add(self, values: Array) -> None:
+        """Count the finite values of an array."""
+        values = values[np.isfinite(values)]
+        if values.size:
+            self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
+            edges = self.quantity.edges
+            self.counts += np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0]
+
+    def quantile(self, q: float) -> float:
+        """Value below which a share ``q`` lies, to a bin's width; NaN without values."""
+        total = self.counts.sum()
+        if not total:
+            return float("nan")
+        at = np.interp(q * total, np.concatenate([[0], np.cumsum(self.counts)]), self.quantity.edges)
+        return float(np.clip(at, self.low, self.high))
+
+    def table(self) -> dict[str, Any]:
+        """As JSON types."""
+        if not self.counts.sum():
+            return {"unit": self.quantity.unit, "count": 0}
+        quantiles = {f"p{round(100 * q)}": self.quantile(q) for q in (0.01, 0.25, 0.5, 0.75, 0.99)}
+        count = int(self.counts.sum())
+        return {"unit": self.quantity.unit, "count": count, "min": self.low, "max": self.high, **quantiles}
+
+
+@dataclass
+class SplitStats:
+    """Counts over the views of one split."""
+
+    scenes: int = 0
+    views: int = 0
+    pixels: int = 0
+    tof_pixels: int = 0
+    tallies: dict[str, Tally] = field(default_factory=lambda: {q.name: Tally(q) for q in QUANTITIES})
+    mask: dict[str, int] = field(default_factory=lambda: {"GOOD": 0, **{str(b.name): 0 for b in MaskBit}})
+    flags: dict[str, int] = field(default_factory=lambda: {str(b.name): 0 for b in TofFlag})
+
+    def table(self) -> dict[str, Any]:
+        """As JSON types; shares of mask and flag bits are of all pixels."""
+        return {
+            "scenes": self.scenes,
+            "views": self.views,
+            "quantities": {name: tally.table() for name, tally in self.tallies.items()},
+            "mask": {name: n / max(1, self.pixels) for name, n in self.mask.items()},
+            "flags": {name: n / max(1, self.tof_pixels) for name, n in self.flags.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A view one of whose numbers stands out.
+
+    Attributes
+    ----------
+    scene, view
+        Which.
+    name
+        Of the number, as in :func:`view_numbers`.
+    value, median
+        The view's, and that of all views.
+    deviations
+        Their difference in robust standard deviations.
+    """
+
+    scene: str
+    view: int
+    name: str
+    value: float
+    median: float
+    deviations: float
+
+
+@dataclass(frozen=True)
+class DatasetStats:
+    """Statistics of a dataset: by split, by view, and the outliers."""
+
+    dataset: Path
+    manifest_sha256: str
+    splits: Mapping[str, SplitStats]
+    views: Sequence[Mapping[str, Any]]
+    outliers: Sequence[Outlier]
+
+    def table(self) -> dict[str, Any]:
+        """As JSON types."""
+        return {
+            "format": "tofcapture-stats",
+            "version": 1,
+            "dataset": str(self.dataset),
+            "manifest_sha256": self.manifest_sha256,
+            "splits": {name: split.table() for name, split in self.splits.items()},
+            "outliers": [vars(o) for o in self.outliers],
+            "views": [
+                {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
+                for row in self.views
+            ],
+        }
+
+
+def incidence_deg(normals: Array, rays: Array) -> Array:
+    """Angle between the ray and the surface's normal, degrees (H, W), of normals (H, W, 3); NaN where they are."""
+    cosine = -np.einsum("hwc,hwc->hw", normals.astype(np.float64), rays) / np.linalg.norm(rays, axis=-1)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def view_arrays(shard: ShardReader, view: int) -> dict[str, Array]:
+    """Every quantity of one view: ground truth and angles where the mask at 1x is 0."""
+    tof, gt = shard.tof(view), shard.ground_truth(view, 1)
+    good = gt.mask == 0
+    return {
+        "gt_depth": gt.depth[good],
+        "tof_depth": tof.depth[np.isfinite(tof.depth)],
+        "tof_minus_gt": (tof.depth - gt.depth)[good],
+        "amplitude": tof.confidence[np.isfinite(tof.confidence)],
+        "incidence": incidence_deg(gt.normals, shard.camera.rays)[good],
+        "celsius": np.array([shard.celsius(view, frame) for frame in range(shard.frames)]),
+    }
+
+
+def view_numbers(arrays: Mapping[str, Array], mask: Array, flags: Array) -> dict[str, float]:
+    """What one view is compared by: the medians of its quantities, the shares of good and of flagged pixels."""
+    finite = {name: values[np.isfinite(values)] for name, values in arrays.items()}
+    medians = {name: float(np.median(v)) if v.size else float("nan") for name, v in finite.items()}
+    return {**medians, "good_share": float((mask == 0).mean()), "flagged_share": float((flags != 0).mean())}
+
+
+def _count(split: SplitStats, arrays: Mapping[str, Array], mask: Array, flags: Array) -> None:
+    for name, values in arrays.items():
+        split.tallies[name].add(values)
+    split.views += 1
+    split.pixels += mask.size
+    split.tof_pixels += flags.size
+    split.mask["GOOD"] += int((mask == 0).sum())
+    for bit in MaskBit:
+        split.mask[str(bit.name)] += int(((mask & bit) > 0).sum())
+    for flag in TofFlag:
+        split.flags[str(flag.name)] += int(((flags & flag) > 0).sum())
+
+
+def outliers(views: Sequence[Mapping[str, Any]]) -> list[Outlier]:
+    """Views that stand out in a number, largest deviation first.
+
+    A number stands out when it is more than :data:`STANDS_OUT` robust standard deviations (1.4826 times the median absolute
+    deviation, with a floor for each number) from the median of all views. A view without a good pixel always does.
+    """
+    if not views:
+        return []
+    middle = float(np.median([row["good_share"] for row in views]))
+    found = [
+        Outlier(row["scene"], row["view"], "good_share", 0.0, middle, -_WORST)
+        for row in views
+        if row["good_share"] == 0
+    ]
+    for name in [k for k, v in views[0].items() if isinstance(v, float)] if len(views) >= FEWEST else ():
+        values = np.array([row[name] for row in views])
+        if not np.isfinite(values).any():
+            continue
+        median = float(np.nanmedian(values))
+        scale = max(_PER_MAD * float(np.nanmedian(np.abs(values - median))), _FLOOR[name])
+        for row, value in zip(views, values, strict=True):
+            z = (value - median) / scale
+            if abs(z) > STANDS_OUT and not (name == "good_share" and value == 0):
+                found.append(Outlier(row["scene"], row["view"], name, float(value), median, float(z)))
+    return sorted(found, key=lambda o: -abs(o.deviations))
+
+
+def dataset_stats(dataset: Path, progress: Callable[[int, int], None] | None = None) -> DatasetStats:
+    """Statistics of a dataset, one pass over its shards.
+
+    Parameters
+    ----------
+    dataset
+        Folder with a manifest.
+    progress
+        Told views done and views in all.
+
+    Raises
+    ------
+    DataError
+        The manifest or a shard is missing or damaged.
+    """
+    manifest = load_manifest(dataset)
+    splits = {name: SplitStats() for name in SPLITS if manifest.split(name)}
+    rows: list[dict[str, Any]] = []
+    total = sum(e.views for e in manifest.scenes.values())
+    for name, entry in sorted(manifest.scenes.items()):
+        splits[entry.split].scenes += 1
+        rows += _scene(dataset, name, entry, splits[entry.split])
+        if progress:
+            progress(len(rows), total)
+    return DatasetStats(Path(dataset), sha256_of(manifest_path(dataset)), splits, rows, outliers(rows))
+
+
+def _scene(dataset: Path, name: str, entry: SceneEntry, split: SplitStats) -> list[dict[str, Any]]:
+    rows = []
+    with ShardReader(dataset / entry.path, entry.sha256) as shard:
+        for view in range(shard.views):
+            arrays, flags = view_arrays(shard, view), shard.flags(view)
+            mask = shard.ground_truth(view, 1).mask
+            _count(split, arrays, mask, flags)
+            rows.append(
+                {"scene": name, "split": entry.split, "view": view, **view_numbers(arrays, mask, flags)}
+            )
+    return rows
