@@ -30,6 +30,7 @@ from calibration.projective.newton import (
     tukey,
 )
 from calibration.projective.rays import Rays, match_rays, predicted_reach, rays_of
+from calibration.projective.weak import along_weak_motions, weak_motions
 from calibration.registration import INLIER_DISTANCE, MIN_POINTS, Registration
 from tofcapture.errors import DataError
 from tofcapture.poses import Float64
@@ -38,6 +39,8 @@ from tofcapture.rig import SPEED_OF_LIGHT
 COARSE = (0.080, 0.040, 0.020)  # m, kernel scales from a guess that is off by centimetres
 COARSE_POINTS = 6000  # rays of the coarse stages, evenly picked
 FINE_STEPS = 20  # most Newton steps of a stage
+WALK_POINTS = 15000  # rays of the walk along weak motions
+WALK_STEPS = 4  # the same, from a place along a weak motion
 FEW_STOP, FINE_STOP = 1e-4, 1e-5  # m and rad; a stage ends when its step is shorter in both
 FINE_GATE = 0.020  # m; residuals beyond it take no part in the last stage, whatever its scale
 TUKEY = (
@@ -114,6 +117,8 @@ def register_projective(
     if distances:
         T = coarse(few, grid, T, distances)
     T, _ = _fine_stage(few, grid, T, FEW_STOP, held, EDGE_KERNELS[0])
+    if distances:
+        T = _walked(rays, grid, T, held)
     T, match = _fine_stage(rays, grid, T, FINE_STOP, held, EDGE_KERNELS[1])
     return _measured(rays, match, T, held)
 
@@ -145,12 +150,18 @@ def _flat(
 
 
 def _fine_stage(
-    rays: Rays, grid: SurfaceGrid, T: Float64, stop: float, held: _Edges, kernel: float
+    rays: Rays,
+    grid: SurfaceGrid,
+    T: Float64,
+    stop: float,
+    held: _Edges,
+    kernel: float,
+    steps: int = FINE_STEPS,
 ) -> tuple[Float64, Match]:
     """Iterate to the end; a ray that meets nothing looks again where it looked last, and comes back if the pose does."""
     reach, before = rays.lengths, np.zeros(6)
     match = match_rays(rays, grid, T, reach, FINE_GATE)
-    for _ in range(FINE_STEPS):
+    for _ in range(steps):
         if len(match.rays) < MIN_POINTS:
             break
         H, g, centre = _equations(match, T, held, kernel)
@@ -165,29 +176,46 @@ def _fine_stage(
     return T, match
 
 
+def _walked(rays: Rays, grid: SurfaceGrid, T: Float64, held: _Edges) -> Float64:
+    """Leave hollows of the noise along motions that the scene hardly holds."""
+    match = match_rays(rays, grid, T, rays.lengths, FINE_GATE)
+    if len(match.rays) < MIN_POINTS:
+        return T
+    some, centre = rays.nearer(WORKING_DEPTH[1]).some(WALK_POINTS), match.points.mean(axis=1)
+    even = normal_equations(match, np.ones(len(match.rays)), centre)[0] + _held_evenly(T, held, centre)
+    ways = weak_motions(even, _radius(match.points, centre))
+
+    def refine(start: Float64) -> tuple[Float64, Match]:
+        return _fine_stage(some, grid, start, FEW_STOP, held, EDGE_KERNELS[0], WALK_STEPS)
+
+    return along_weak_motions(T, ways, centre, refine, TUKEY) if ways else T
+
+
+def _held_evenly(T: Float64, held: _Edges, centre: Float64) -> Float64:
+    """Unweighted normal matrix (6, 6) of the edges."""
+    if held is None:
+        return np.zeros((6, 6))
+    found, _ = match_edges(*held, T, EDGE_KERNELS[1])
+    return normal_equations(found, np.ones(len(found.rays)), centre)[0]
+
+
 def _equations(match: Match, T: Float64, held: _Edges, kernel: float) -> tuple[Float64, Float64, Float64]:
     """Normal equations of surfaces and edges, and the point that they turn about."""
     centre = match.points.mean(axis=1)
-    H, g = normal_equations(match, _weights(match) / _scale(match) ** 2, centre)
+    H, g = normal_equations(match, _weights(match), centre)
     if held is None:
         return H, g, centre
-    found, weights = match_edges(*held, T, kernel)
-    H_edge, g_edge = normal_equations(found, weights, centre)
+    H_edge, g_edge = normal_equations(*match_edges(*held, T, kernel), centre)
     return H + H_edge, g + g_edge, centre
 
 
 def _weights(match: Match) -> Float64:
+    """Tukey's weights over the variance at its measured scale."""
     sigma = np.sqrt(match.variance)
-    return tukey(match.distance / (TUKEY * _scale(match) * sigma)) / match.variance
-
-
-def _scale(match: Match) -> float:
-    return max(robust_scale(match.distance / np.sqrt(match.variance)), MIN_SCALE)
-
-
-def _step(match: Match, weights: Float64) -> tuple[Float64, Float64]:
-    centre = match.points.mean(axis=1)
-    return newton_step(*normal_equations(match, weights, centre)), centre
+    normalised = match.distance / sigma
+    sigma *= max(robust_scale(normalised), MIN_SCALE)
+    out: Float64 = tukey(match.distance / (TUKEY * sigma)) / np.square(sigma)
+    return out
 
 
 def _measured(rays: Rays, match: Match, T: Float64, held: _Edges) -> Registration:
@@ -197,15 +225,14 @@ def _measured(rays: Rays, match: Match, T: Float64, held: _Edges) -> Registratio
     fitness = inliers / len(rays.lengths)
     if inliers < MIN_POINTS:
         return _nothing(T, inliers, fitness)
-    H, g, about = _equations(match, T, held, EDGE_KERNELS[1])
     centre = match.points[:, near].mean(axis=1)
+    H, g = normal_equations(match, _weights(match), centre)
     information, even = _information(match, centre), normal_equations(match, near / 1.0, centre)[0]
     if held is not None:
         found, weights = match_edges(*held, T, EDGE_KERNELS[1])
-        information = information + normal_equations(found, weights, centre)[0]
+        H_edge, g_edge = normal_equations(found, weights, centre)
+        H, g, information = H + H_edge, g + g_edge, information + H_edge
         even = even + normal_equations(found, np.ones(len(found.rays)), centre)[0]
-    step = newton_step(H, g)
-    step[:3] += np.cross(step[3:], centre - about)
     return Registration(
         T_target_source=T,
         inliers=inliers,
@@ -214,7 +241,7 @@ def _measured(rays: Rays, match: Match, T: Float64, held: _Edges) -> Registratio
         information=information,
         condition=_condition(even / inliers, match.points[:, near], centre),
         centre=centre,
-        step=step,
+        step=newton_step(H, g),
     )
 
 
@@ -224,9 +251,11 @@ def _nothing(T: Float64, inliers: int, fitness: float) -> Registration:
 
 def _information(match: Match, centre: Float64) -> Float64:
     """Inverse covariance of an M-estimate: ``mean(psi')^2 / mean(psi^2) J^T V^-1 J`` (Huber 1981, 7.6)."""
-    u = match.distance / (TUKEY * _scale(match) * np.sqrt(match.variance))
+    sigma = np.sqrt(match.variance)
+    scale = max(robust_scale(match.distance / sigma), MIN_SCALE)
+    u = match.distance / (TUKEY * scale * sigma)
     inside = np.maximum(1 - u**2, 0)
-    psi = u * inside**2 * TUKEY * _scale(match)
+    psi = u * inside**2 * TUKEY * scale
     slope = np.where(np.abs(u) < 1, inside * (1 - 5 * u**2), 0.0)
     kept = np.abs(u) < 1
     efficiency = float(np.mean(slope[kept]) ** 2 / np.mean(np.square(psi[kept])))
@@ -236,7 +265,10 @@ def _information(match: Match, centre: Float64) -> Float64:
 
 def _condition(H: Float64, points: Float64, centre: Float64) -> float:
     """Condition number of the unweighted normal matrix, rotations as motion at the mean radius; as of any backend."""
-    radius = np.sqrt(np.mean(np.square(points - centre[:, None]).sum(axis=0)))
-    even = np.repeat([1, 1 / radius], 3)
+    even = np.repeat([1, 1 / _radius(points, centre)], 3)
     values = np.linalg.eigvalsh(H * even * even[:, None])
     return float(values[-1] / values[0]) if values[0] > 1e-15 else np.inf
+
+
+def _radius(points: Float64, centre: Float64) -> float:
+    return float(np.sqrt(np.mean(np.square(points - centre[:, None]).sum(axis=0))))

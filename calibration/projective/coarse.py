@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from calibration.projective.grid import SurfaceGrid
+from calibration.projective.grid import GRAZING, SurfaceGrid
 from calibration.projective.newton import Match, moved, newton_step, normal_equations, tukey
 from calibration.projective.rays import Rays, match_rays, predicted_reach
 from calibration.registration import MIN_POINTS
@@ -46,14 +46,14 @@ def _coarse_stage(rays: Rays, grid: SurfaceGrid, T: Float64, distance: float, ta
     """
     damping, best = DAMPING, T
     match = match_rays(rays, grid, T, rays.lengths, distance)
-    cost = _left(rays, grid, T, match, distance)
+    cost = _left(match, distance)
     for _ in range(COARSE_STEPS):
         if len(match.rays) < MIN_POINTS:
             break
         step, centre = take(match, tukey(match.distance / distance) / match.variance, damping)
         T = moved(best, step, centre)
         tried = match_rays(rays, grid, T, predicted_reach(match, rays.lengths), distance)
-        left = _left(rays, grid, T, tried, distance)
+        left = _left(tried, distance)
         if left < cost:
             best, match, cost, damping = T, tried, left, damping / 5
         else:
@@ -90,10 +90,27 @@ def _shifted(rays: Rays, grid: SurfaceGrid, T: Float64) -> Float64:
     if len(match.rays) < MIN_POINTS:
         return T
     x, y = _slides(match)
-    shifts = [transform(np.eye(3), a * x + b * y) @ T for a in SCAN for b in SCAN]
-    costs = [_unexplained(rays, grid, there, SCAN_GATE) for there in shifts]
+    costs = np.array([[_slid(rays, grid, T, a * x + np.outer(SCAN, y))] for a in SCAN]).ravel()
     best = int(np.argmin(costs))
-    return shifts[best] if costs[best] < SCAN_GAIN * _left(rays, grid, T, match, SCAN_GATE) else T
+    if costs[best] >= SCAN_GAIN * _left(match, SCAN_GATE):
+        return T
+    a, b = SCAN[best // len(SCAN)], SCAN[best % len(SCAN)]
+    return transform(np.eye(3), a * x + b * y) @ T
+
+
+def _slid(rays: Rays, grid: SurfaceGrid, T: Float64, shifts: Float64) -> Float64:
+    """Shares (K,) of the rays left unexplained after each of the shifts (K, 3)."""
+    d = np.einsum("ij,jn->in", T[:3, :3], rays.directions)
+    ends = (T[:3, 3:] + rays.lengths * d)[:, None, :] + shifts.T[:, :, None]
+    planes = grid.planes_at(ends.reshape(3, -1))
+    n = planes.normals.reshape(ends.shape)
+    distance = n[0] * ends[0] + n[1] * ends[1] + n[2] * ends[2] - planes.offsets.reshape(ends.shape[1:])
+    cosine = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
+    met = planes.found.reshape(cosine.shape) & (cosine >= GRAZING)
+    explained = np.where(met, tukey(distance / SCAN_GATE), 0.0).sum(axis=1)
+    seen = np.count_nonzero(planes.inside.reshape(cosine.shape), axis=1)
+    out: Float64 = 1 - explained / np.maximum(seen, MIN_POINTS)
+    return out
 
 
 def _slides(match: Match) -> tuple[Float64, Float64]:
@@ -104,12 +121,6 @@ def _slides(match: Match) -> tuple[Float64, Float64]:
     return weak[:, 0], weak[:, 1]
 
 
-def _unexplained(rays: Rays, grid: SurfaceGrid, T: Float64, distance: float) -> float:
-    return _left(rays, grid, T, match_rays(rays, grid, T, rays.lengths, distance), distance)
-
-
-def _left(rays: Rays, grid: SurfaceGrid, T: Float64, match: Match, distance: float) -> float:
+def _left(match: Match, distance: float) -> float:
     """Share of the rays in the stereo camera's view that are left without a surface, by Tukey's kernel of that scale."""
-    ends = np.einsum("ij,jn->in", T[:3, :3], rays.directions * rays.lengths) + T[:3, 3:]
-    seen = int(np.count_nonzero(grid.in_view(ends)))
-    return 1 - float(np.sum(tukey(match.distance / distance))) / max(seen, MIN_POINTS)
+    return 1 - float(np.sum(tukey(match.distance / distance))) / max(match.seen, MIN_POINTS)

@@ -12,6 +12,7 @@ would be hidden from both cameras.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -101,13 +102,13 @@ def stereo_edges(points: NDArray[np.floating], camera: Camera, grid: SurfaceGrid
     if points.shape != (*camera.shape, 3):
         raise DataError(f"stereo points: expected ({camera.height}, {camera.width}, 3), got {points.shape}")
     depth = np.ascontiguousarray(points[..., 2])
-    across, down = _curve(depth), _curve(np.ascontiguousarray(depth.T))
+    across, down = (_curve(*found) for found in _jumps(depth))
     pixels = np.concatenate([across[0], down[0][:, ::-1]])
     outward = np.concatenate([across[1], down[1][:, ::-1]])
     measured = np.concatenate([across[2], down[2]])
     if len(pixels) <= NEIGHBOURS:
         return _no_edges(camera)
-    near = pixels[cKDTree(pixels).query(pixels, NEIGHBOURS)[1]]
+    near = pixels[cKDTree(pixels, balanced_tree=False, compact_nodes=False).query(pixels, NEIGHBOURS)[1]]
     at, normal, straight = _tangents(near)
     normal = np.where((normal * outward).sum(axis=1, keepdims=True) < 0, -normal, normal)
     at, normal, measured = at[straight], normal[straight], measured[straight]
@@ -115,7 +116,7 @@ def stereo_edges(points: NDArray[np.floating], camera: Camera, grid: SurfaceGrid
     if not good.any():
         return _no_edges(camera)
     P, t, w = (np.ascontiguousarray(x[:, good]) for x in (P, t, w))
-    return StereoEdges(camera, P, t, w, cKDTree(at[good]))
+    return StereoEdges(camera, P, t, w, cKDTree(at[good], balanced_tree=False, compact_nodes=False))
 
 
 def _no_edges(camera: Camera) -> StereoEdges:
@@ -156,17 +157,31 @@ def _unit(a: Float64) -> Float64:
     return out
 
 
-def _curve(depth: NDArray[np.floating]) -> tuple[Float64, Float64, Float64]:
-    """Borders (N, 2), (u, v), between the columns of an image where one side lies deeper, the ways there, the nearer depths."""
-    step = depth[:, 1:-2] - depth[:, 2:-1]
-    row, column = np.nonzero(np.abs(step) > JUMP)
-    z = depth[row[:, None], column[:, None] + np.arange(4)]
+def _jumps(
+    depth: NDArray[np.floating],
+) -> Iterator[tuple[NDArray[np.floating], NDArray[np.intp], NDArray[np.intp]]]:
+    """Views of a depth image with each of its axes last, rows and columns in them after which it jumps, borders left out."""
+    step = np.zeros_like(depth)  # one buffer: fresh pages would cost more than the arithmetic
+    for axis in (1, 0):
+        before, after = (slice(None),) * axis + (slice(1, -2),), (slice(None),) * axis + (slice(2, -1),)
+        step[...] = 0
+        np.subtract(depth[after], depth[before], out=step[before])
+        at = np.flatnonzero(np.abs(step, out=step) > JUMP)
+        row, column = np.divmod(at, depth.shape[1])
+        yield (depth, row, column) if axis == 1 else (depth.T, column, row)
+
+
+def _curve(
+    depth: NDArray[np.floating], row: NDArray[np.intp], column: NDArray[np.intp]
+) -> tuple[Float64, Float64, Float64]:
+    """Borders (N, 2), (u, v), after those columns where one side lies deeper, the ways there, the nearer depths."""
+    z = depth[row[:, None], column[:, None] + np.arange(-1, 3)]
     ends = (np.abs(z[:, 0] - z[:, 1]) < FLAT) & (np.abs(z[:, 3] - z[:, 2]) < FLAT)
-    row, column = row[ends], column[ends]
+    z, row, column = z[ends], row[ends], column[ends]
     outward = np.zeros((len(row), 2))
-    outward[:, 0] = np.where(step[row, column] < 0, 1.0, -1.0)
-    measured = z[ends][:, 1:3].min(axis=1).astype(np.float64)
-    return np.column_stack([column + 1.5, row]).astype(np.float64), outward, measured
+    outward[:, 0] = np.where(z[:, 2] > z[:, 1], 1.0, -1.0)
+    measured = z[:, 1:3].min(axis=1).astype(np.float64)
+    return np.column_stack([column + 0.5, row]).astype(np.float64), outward, measured
 
 
 def _tangents(near: Float64) -> tuple[Float64, Float64, NDArray[np.bool_]]:

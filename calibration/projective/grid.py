@@ -19,6 +19,7 @@ from tofcapture.poses import Float64
 
 BLOCK = 2  # px averaged along each axis; a ToF pixel covers six
 FULL = 0.75  # share of a block's pixels that must be measured
+STRIP = 16  # rows of blocks fitted at a time: they stay in the processor's cache
 BEND = 1.0  # departure from the tangent plane after one block, in blocks: beyond it lies a depth edge, not a surface
 GRAZING = 0.1  # cosine of the steepest incidence (84 deg) at which a ray's intersection is believed
 
@@ -35,11 +36,14 @@ class Planes:
         (N,) float64, metres.
     found
         (N,) bool; where False the other two mean nothing.
+    inside
+        (N,) bool: in the camera's field of view, measured there or not.
     """
 
     normals: Float64
     offsets: Float64
     found: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -51,14 +55,14 @@ class SurfaceGrid:
     camera
         Intrinsics of the image of blocks.
     coefficients
-        (h w, 6) float64: ``1/z = c0 + c1 s + c2 t + c3 s^2 + c4 s t + c5 t^2``, 1/m, with (s, t) the distance to the
-        block's centre in blocks.
+        (h w, 6), of the map's own precision: ``1/z = c0 + c1 s + c2 t + c3 s^2 + c4 s t + c5 t^2``, 1/m, with (s, t) the
+        distance to the block's centre in blocks.
     smooth
         (h w,) bool: measured all around, within the working depth, and no depth edge.
     """
 
     camera: Camera
-    coefficients: Float64
+    coefficients: NDArray[np.floating]
     smooth: NDArray[np.bool_]
 
     def planes_at(self, points: Float64) -> Planes:
@@ -78,12 +82,9 @@ class SurfaceGrid:
         u, v, inside = self._pixels(points)
         column, row = np.rint(u), np.rint(v)
         cell = row.astype(np.intp) * camera.width + column.astype(np.intp)
-        normals, offsets = _tangent(self.coefficients[cell].T, u, v, u - column, v - row, camera)
-        return Planes(normals, offsets, inside & self.smooth[cell])
-
-    def in_view(self, points: Float64) -> NDArray[np.bool_]:
-        """Which of the points (3, N), stereo frame, lie in the camera's field of view, measured there or not."""
-        return self._pixels(points)[2]
+        c = np.ascontiguousarray(self.coefficients.take(cell, axis=0).T, dtype=np.float64)
+        normals, offsets = _tangent(c, u, v, u - column, v - row, camera)
+        return Planes(normals, offsets, inside & self.smooth.take(cell), inside)
 
     def _pixels(self, points: Float64) -> tuple[Float64, Float64, NDArray[np.bool_]]:
         """Pixels (N,) of points (3, N), zero outside the image, and which lie inside."""
@@ -98,7 +99,7 @@ class SurfaceGrid:
     def cloud(self) -> Cloud:
         """Block centres with normals that face the camera, stereo frame; what nearest-neighbour backends and gates take."""
         rays = self.camera.rays.reshape(-1, 3)[self.smooth]
-        c = self.coefficients[self.smooth].T
+        c = self.coefficients[self.smooth].T.astype(np.float64)
         u = rays[:, 0] * self.camera.fx + self.camera.cx
         v = rays[:, 1] * self.camera.fy + self.camera.cy
         normals, _ = _tangent(c, u, v, np.zeros(len(u)), np.zeros(len(u)), self.camera)
@@ -138,29 +139,36 @@ def grid_of_depth(depth: NDArray[np.floating], camera: Camera) -> SurfaceGrid:
     """Fit the surface of a depth map (H, W), metres, NaN where nothing was measured; see :func:`surface_grid`."""
     q, measured = _block_means(depth)
     height, width = q.shape
-    c = np.zeros((6, height, width))
-    c[:, 1:-1, 1:-1] = _quadratic(q)
-    c[0] -= (c[3] + c[5]) * (BLOCK**2 - 1) / (12 * BLOCK**2)
+    cx, cy = ((p + 0.5) / BLOCK - 0.5 for p in (camera.cx, camera.cy))
+    small = Camera(width, height, camera.fx / BLOCK, camera.fy / BLOCK, cx, cy)
+    coefficients = np.zeros((height, width, 6), dtype=q.dtype)
     smooth = np.zeros((height, width), dtype=bool)
     smooth[1:-1, 1:-1] = _all_of_nine(measured)
-    small = Camera(
-        width, height, camera.fx / BLOCK, camera.fy / BLOCK, *((p + 0.5) / BLOCK - 0.5 for p in (camera.cx, camera.cy))
-    )  # fmt: skip
-    bend = np.abs(c[3:]).max(axis=0)
+    for top in range(1, height - 1, STRIP):
+        inner = slice(top, min(top + STRIP, height - 1)), slice(1, -1)
+        c = _quadratic(q[top - 1 : top + STRIP + 1])
+        c[0] -= (c[3] + c[5]) * q.dtype.type((BLOCK**2 - 1) / (12 * BLOCK**2))
+        coefficients[inner] = np.moveaxis(c, 0, -1)
+        smooth[inner] &= _is_surface(c, small)
+    return SurfaceGrid(small, coefficients.reshape(-1, 6), smooth.ravel())
+
+
+def _is_surface(c: NDArray[np.floating], camera: Camera) -> NDArray[np.bool_]:
+    """Which quadratics (6, h, w) lie within the working depth and bend as a surface does."""
     near, far = WORKING_DEPTH
-    smooth &= (c[0] > 1 / far) & (c[0] < 1 / near) & (bend * small.fx < BEND * c[0])
-    return SurfaceGrid(small, np.ascontiguousarray(c.reshape(6, -1).T), smooth.ravel())
+    bend = np.abs(c[3:]).max(axis=0)
+    out: NDArray[np.bool_] = (c[0] > 1 / far) & (c[0] < 1 / near) & (bend * camera.fx < BEND * c[0])
+    return out
 
 
-def _block_means(depth: NDArray[np.floating]) -> tuple[Float64, NDArray[np.bool_]]:
+def _block_means(depth: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
     """Mean inverse depth (h, w) of blocks, and whether enough of their pixels were measured."""
     height, width = (n // BLOCK for n in depth.shape)
     z = np.ascontiguousarray(depth[: height * BLOCK, : width * BLOCK])
     valid = z > 0
     q = np.divide(1, z, out=np.zeros_like(z), where=valid)
-    total = _block_sums(q).astype(np.float64)
     count = _block_sums(valid.view(np.uint8))
-    return total / np.maximum(count, 1), count >= FULL * BLOCK**2
+    return _block_sums(q) / np.maximum(count, 1).astype(z.dtype), count >= FULL * BLOCK**2
 
 
 def _block_sums(image: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.floating] | NDArray[np.uint8]:
@@ -173,8 +181,8 @@ def _block_sums(image: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.f
     return out
 
 
-def _quadratic(q: Float64) -> Float64:
-    """Least-squares quadratics (6, h - 2, w - 2) on the 3 x 3 neighbourhoods of an image (h, w)."""
+def _quadratic(q: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Least-squares quadratics (6, h - 2, w - 2), 1/m, on the 3 x 3 neighbourhoods of an image (h, w)."""
     left, middle, right = q[:, :-2], q[:, 1:-1], q[:, 2:]
     sums, slopes, squares = left + middle + right, right - left, left + right
     total = sums[:-2] + sums[1:-1] + sums[2:]

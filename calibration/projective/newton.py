@@ -36,6 +36,8 @@ class Match:
         (M,) of ``distance``, m^2.
     reach
         (M,) predicted length of the rays, metres.
+    seen
+        How many rays end in the camera's field of view, whether they meet a plane there or not.
     """
 
     rays: NDArray[np.intp]
@@ -44,6 +46,7 @@ class Match:
     distance: Float64
     variance: Float64
     reach: Float64
+    seen: int = 0
 
 
 def tukey(u: Float64) -> Float64:
@@ -54,17 +57,23 @@ def tukey(u: Float64) -> Float64:
 
 def normal_equations(match: Match, weights: Float64, centre: Float64) -> tuple[Float64, Float64]:
     """``J^T W J`` (6, 6) and ``J^T W e`` (6,) in (translation of ``centre``, rotation about it), target axes."""
-    J = np.empty((6, len(weights)))
-    J[:3] = match.normals
-    x, y, z = match.points - centre[:, None]
-    a, b, c = match.normals
-    J[3], J[4], J[5] = y * c - z * b, z * a - x * c, x * b - y * a
+    J = jacobian(match, centre)
     weighted = J * weights
     H = np.empty((6, 6))
     for i in range(6):
         for j in range(i, 6):
             H[i, j] = H[j, i] = np.sum(weighted[i] * J[j])
     return H, np.sum(weighted * match.distance, axis=1)
+
+
+def jacobian(match: Match, centre: Float64) -> Float64:
+    """Derivative (6, M) of the distances by (translation of ``centre``, rotation about it), target axes."""
+    J = np.empty((6, len(match.rays)))
+    J[:3] = match.normals
+    x, y, z = match.points - centre[:, None]
+    a, b, c = match.normals
+    J[3], J[4], J[5] = y * c - z * b, z * a - x * c, x * b - y * a
+    return J
 
 
 def newton_step(H: Float64, g: Float64) -> Float64:

@@ -63,18 +63,19 @@ def match_rays(rays: Rays, grid: SurfaceGrid, T: Float64, reach: Float64, gate: 
     planes = grid.planes_at(o[:, None] + reach * d)
     n = planes.normals
     cosine = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
-    steep = cosine < GRAZING
-    predicted = (planes.offsets - (n[0] * o[0] + n[1] * o[1] + n[2] * o[2])) / np.where(steep, 1.0, cosine)
-    distance = cosine * (rays.lengths - predicted)
-    met = np.flatnonzero(planes.found & ~steep & (np.abs(distance) < gate))
-    predicted, cosine = predicted[met], cosine[met]
+    beyond = planes.offsets - (n[0] * o[0] + n[1] * o[1] + n[2] * o[2])  # predicted length times cosine
+    distance = cosine * rays.lengths - beyond
+    met = np.flatnonzero(planes.found & (cosine >= GRAZING) & (np.abs(distance) < gate))
+    cosine = cosine.take(met)
+    predicted = beyond.take(met) / cosine
     return Match(
         rays=met,
-        points=o[:, None] + predicted * d[:, met],
-        normals=n[:, met],
-        distance=distance[met],
-        variance=(cosine * rays.sigma[met]) ** 2 + STEREO_SIGMA**2,
+        points=o[:, None] + predicted * d.take(met, axis=1),
+        normals=n.take(met, axis=1),
+        distance=distance.take(met),
+        variance=(cosine * rays.sigma.take(met)) ** 2 + STEREO_SIGMA**2,
         reach=predicted,
+        seen=int(np.count_nonzero(planes.inside)),
     )
 
 
