@@ -18,7 +18,7 @@ $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet --upgrade pip
 	$(VENV)/bin/python -m pip install --quiet $(TORCH)
-	$(VENV)/bin/python -m pip install --quiet -e ".[all]" --group dev
+	$(VENV)/bin/python -m pip install --quiet -e ".[all]" --group dev --group docs
 	touch $(STAMP)
 
 demo: $(STAMP)
@@ -35,6 +35,8 @@ lint: $(STAMP)
 
 docs: $(STAMP)
 	$(VENV)/bin/python -m tofcapture.files.page > docs/formats.md
+	$(VENV)/bin/python -m tofcapture.record.daemon.schema > docs/openapi.json
+	$(VENV)/bin/python -m sphinx -q -W --keep-going -b html docs build/docs
 
 clean:
 	rm -rf $(VENV)

@@ -34,7 +34,7 @@ from tofcapture.dataset.sample import (
 from tofcapture.dataset.truth import view_error
 from tofcapture.files.seal import sealed_digest
 from tofcapture.files.shard_writer import ShardWriter
-from tofcapture.files.view import read_view
+from tofcapture.files.view import read_depth_view
 from tofcapture.ops.crop import crop_depth, find_crop
 from tofcapture.ops.denoise import denoise
 from tofcapture.ops.normals import PlaneField
@@ -68,11 +68,10 @@ def stages(paths: list[Path], rig, folder: Path) -> Stages:
     run, config = Stages(), SampleConfig()
     for path in paths:
         run("digest of the view", sealed_digest, path)
-        view = run("read the view", read_view, path)
+        view, depth = run("read the view", read_depth_view, path)
         rng = np.random.default_rng(view.index)
         run("decode ToF", decode_burst, view.tof, view.tof.info)
-        measured = np.ascontiguousarray(view.stereo.points[..., 2])
-        native = np.where(run("denoise", denoise, measured, rig.stereo), measured, np.float32(np.nan))
+        native = np.where(run("denoise", denoise, depth, rig.stereo), depth, np.float32(np.nan))
         sheet = run("triangulate", triangulate, native, rig.stereo)
         field = run("sums for planes", PlaneField, np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
         up = (view.arm_before.T_base_flange @ rig.T_flange_tof)[2, :3]
@@ -85,9 +84,11 @@ def stages(paths: list[Path], rig, folder: Path) -> Stages:
             )
             found = run(f"planes {scale}x", smoothed, found, field, rig, camera)
             run(f"mask {scale}x", assemble, found, rig, camera, crop)
-        sample = run("ALL OF make_sample", make_sample, view, rig, config, np.random.default_rng(view.index))
+        sample = run(
+            "ALL OF make_sample", make_sample, view, rig, config, np.random.default_rng(view.index), depth
+        )
         with ShardWriter(folder / "s.h5", view.scene, rig, view.tof.info, view.stereo.info, 1) as shard:
-            run("compress", shard.add, sample)
+            run("compress", shard.add, sample, path)
             run("verify, fsync", shard.seal, {})
     return run
 

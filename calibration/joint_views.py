@@ -97,7 +97,9 @@ def joint_view_of(view: View, name: str) -> JointView:
     hz = phase.frequencies(info.modulation_hz)
     rays = (info.camera.rays / info.camera.ray_lengths[..., None]).reshape(-1, 3)
     high_sigma = range_sigma(view.tof).reshape(-1)[pixels]
-    lit = decoded.amplitude.reshape(len(hz), -1)[:, pixels]  # of the board: a dark pixel elsewhere has none to divide by
+    lit = decoded.amplitude.reshape(len(hz), -1)[
+        :, pixels
+    ]  # of the board: a dark pixel elsewhere has none to divide by
     sigma = [high_sigma * hz[-1] / f * lit[-1] / a for f, a in zip(hz, lit, strict=True)]
     points, surface = view.stereo.points, stereo_cloud(view.stereo)
     return JointView(

@@ -156,6 +156,17 @@ def test_the_sample_carries_the_view(sample, view):
     np.testing.assert_array_equal(sample.native_depth[native], view.stereo.points[..., 2][native])
 
 
+def test_without_a_crop_nothing_is_outside(view, sample):
+    """A radius of a hundred metres keeps the table in, and changes no depth."""
+    rig = true_rig(view)
+    whole = make_sample(view, rig, SampleConfig(crop_radius=1000.0), np.random.default_rng(view.index))
+    for scale in (1, 2):
+        assert not (whole.ground_truth[scale].mask & MaskBit.OUTSIDE).any()
+        np.testing.assert_array_equal(whole.ground_truth[scale].depth, sample.ground_truth[scale].depth)
+    assert (sample.ground_truth[2].mask & MaskBit.OUTSIDE).any()
+    assert np.isfinite(whole.native_depth).sum() > np.isfinite(sample.native_depth).sum()
+
+
 @pytest.mark.parametrize("with_table", [True, False])
 def test_the_mask_is_what_numpy_says(sample, view, with_table):
     """GRAZING and OUTSIDE of the compiled pass are those of ops.normals.grazing and ops.crop.inside."""
@@ -169,7 +180,10 @@ def test_the_mask_is_what_numpy_says(sample, view, with_table):
     points = camera.unproject(depth)
     expected = grazing(points, normals, (np.zeros(3), rig.T_tof_stereo[:3, 3]))
     np.testing.assert_array_equal((found & MaskBit.GRAZING) > 0, expected)
-    np.testing.assert_array_equal((found & MaskBit.OUTSIDE) == 0, inside(crop, points))
+    kept = (
+        inside(crop, points) if with_table else np.ones(camera.shape, dtype=bool)
+    )  # nothing to be outside of
+    np.testing.assert_array_equal((found & MaskBit.OUTSIDE) == 0, kept)
     assert 0 < (found == 0).sum() < found.size
 
 
@@ -208,7 +222,9 @@ def test_build_check_and_read(recording, tmp_path):
     card = (out / "README.md").read_text()
     assert "| train | 2 |" in card
     described = json.loads((out / "croissant.json").read_text())
-    assert {d["sha256"] for d in described["distribution"]} == {e.sha256 for e in result.scenes.values()}
+    promised = {d["contentUrl"]: d["sha256"] for d in described["distribution"]}
+    assert promised.pop("manifest.json") == sha256_of(out / "manifest.json")
+    assert set(promised.values()) == {e.sha256 for e in result.scenes.values()}
     with ShardReader(out / "shards/box.h5") as shard:
         assert [shard.index(0), shard.index(1)] == [0, 2]
         assert shard.provenance["gt"]["p99_error_mm"] <= 3.0

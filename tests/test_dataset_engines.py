@@ -10,6 +10,7 @@ import sys
 from dataclasses import replace
 from multiprocessing import active_children
 
+import numpy as np
 import pytest
 
 from tests.test_dataset_build import simulate, true_rig
@@ -32,7 +33,8 @@ def recording(tmp_path_factory):
     for number, scene in enumerate(SCENES):
         view = simulate(scene, 1)
         for index in range(3 if number == 0 else 2):
-            write_view(view_path(root, scene, index), replace(view, index=index))
+            burst = replace(view.tof, raw=view.tof.raw + np.uint16(index))  # no view is another's copy
+            write_view(view_path(root, scene, index), replace(view, index=index, tof=burst))
     (root / "rig.toml").write_text(dumps_rig(true_rig(view)))
     return root
 

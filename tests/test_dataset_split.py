@@ -53,3 +53,40 @@ def test_tiny_datasets_have_one_object_to_test_on():
     assert splits["gear"] == splits["gear-2"]
     assert assign_splits(["mug", "mug-2"]) == {"mug": "train", "mug-2": "train"}
     assert TINY == 10
+
+
+SETS = st.dictionaries(
+    st.builds("{}-{}x".format, STEMS, st.integers(1, 30)),
+    st.lists(STEMS, max_size=3),
+    min_size=2,
+    max_size=25,
+)
+
+
+@given(SETS)
+@settings(max_examples=60, deadline=None)
+def test_scenes_that_share_an_object_share_a_split(sets):
+    """No object that a scene is known to show is in two splits, whatever chains of scenes tie objects together."""
+    splits = assign_splits(sets, sets)
+    homes = {}
+    for scene, names in sets.items():
+        for name in names:
+            assert homes.setdefault(name, splits[scene]) == splits[scene]
+    assert assign_splits(sorted(sets, reverse=True), sets) == splits
+
+
+def test_adding_scenes_with_objects_moves_few():
+    """Of 500 scenes with two objects out of 800 each, 50 more move only those whose group got a new first object."""
+    sets = {f"s{i}x": [f"o{i}y", f"o{i + (i % 5 == 0)}y"] for i in range(550)}
+    few = dict(list(sets.items())[:500])
+    before, after = assign_splits(few, few), assign_splits(sets, sets)
+    assert sum(before[s] != after[s] for s in few) <= 2
+    assert set(after.values()) == {"train", "val", "test"}
+
+
+def test_without_objects_names_decide_as_before():
+    """A scene whose objects are not known is split by its name, beside others whose objects are."""
+    names = [f"o{i}x" for i in range(40)]
+    assert assign_splits(names, {names[0]: []}) == assign_splits(names)
+    tied = assign_splits(names, {names[0]: ["cup"], names[1]: ["cup"], names[2]: ["o0x"]})
+    assert tied[names[0]] == tied[names[1]] == tied[names[2]]

@@ -19,7 +19,7 @@ from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.layout import VIEW
 from tofcapture.files.seal import digest_path, partial_path, sealed_digest, stored_digest, write_text
-from tofcapture.files.view import read_view, view_path, write_view
+from tofcapture.files.view import read_depth_view, read_view, view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth, View
 from tofcapture.poses import exp
 from tofcapture.rig import RangeError, Rig
@@ -155,6 +155,24 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
         write_view(path, make_view(2))
     assert same(read_view(path), make_view(1))
     assert not path.with_name("view-007.h5.partial").exists()
+
+
+def test_depth_alone_is_z_of_the_whole(tmp_path, monkeypatch):
+    """Reading without x and y gives z bit by bit and everything else as it is; a file of one chunk is read as well."""
+    view = make_view()
+    write_view(tmp_path / "a.h5", view)
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file["stereo/points"].chunks[-1] == 1
+    found, depth = read_depth_view(tmp_path / "a.h5")
+    assert depth.tobytes() == np.ascontiguousarray(view.stereo.points[..., 2]).tobytes()
+    assert np.isnan(found.stereo.points).all()
+    assert same(replace(found, stereo=view.stereo), view)
+    with monkeypatch.context() as patch:
+        patch.setattr("tofcapture.files.view._POINTS", "none")
+        write_view(tmp_path / "b.h5", view)
+    with h5py.File(tmp_path / "b.h5") as file:
+        assert file["stereo/points"].chunks[-1] == 3
+    assert read_depth_view(tmp_path / "b.h5")[1].tobytes() == depth.tobytes()
 
 
 def test_a_disk_that_lies_is_noticed(tmp_path, monkeypatch):

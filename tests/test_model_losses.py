@@ -115,9 +115,7 @@ def test_stages_take_the_losses_they_are_due(stage, parts):
     )
     target = Target(gt, normals, mask, ~mask)
     k = torch.tensor([[20.0, 20.0, 7.5, 5.5]] * 2)
-    found = objective(
-        Losses(chamfer_radius=1), stage, Estimate(depth, normals, error + 0.01, depth, normals), target, k
-    )
+    found = objective(Losses(), stage, Estimate(depth, normals, error + 0.01, depth, normals), target, k)
     assert found.parts.keys() == parts
     assert found.total.item() == pytest.approx(sum(v.item() for v in found.parts.values()), rel=1e-5)
     assert found.winners.sum() == (2 if "chamfer" in parts else 0)

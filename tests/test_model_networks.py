@@ -26,8 +26,9 @@ from tofcapture_model.config import (
     presets,
 )
 from tofcapture_model.frame import Frame
-from tofcapture_model.joint import JointModel, build_model, select_stage
+from tofcapture_model.joint import JointModel
 from tofcapture_model.unet import UNet, bilinear_logits, convex_upsample, pad_to_multiple
+from tofcapture_model.zoo import build_model, select_stage
 
 TINY_PAPER = Network(width=2, levels=3, refine_iterations=1)
 TINY_COMPACT = replace(preset("demo").network, width=4, levels=2)
@@ -46,6 +47,7 @@ def frame(h=36, w=44, batch=2, seed=0):
         confidence=torch.rand(batch, 1, h, w, generator=g),
         gap=0.05 * torch.randn(batch, 1, h, w, generator=g),
         cues=0.01 * torch.randn(batch, 4, h, w, generator=g),
+        modulation=torch.tensor([[20e6, 100e6]]).expand(batch, 2),
         intrinsics=k,
     )
 

@@ -24,6 +24,7 @@ from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
+from tofcapture.files.seal import sha256_of
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, TofMaps
 from tofcapture.files.shard_writer import ShardWriter
 from tofcapture.frames import StereoInfo, TofInfo
@@ -32,7 +33,6 @@ from tofcapture.poses import look_at
 from tofcapture.rig import SPEED_OF_LIGHT, Rig
 from tofcapture_model.checkpoint import save_model
 from tofcapture_model.config import preset
-from tofcapture_model.joint import build_model
 from tofcapture_model.report import write_report
 from tofcapture_model.report.alignment import alignment
 from tofcapture_model.report.clouds import BACKGROUND, render, shaded_palette, side_view
@@ -42,6 +42,7 @@ from tofcapture_model.report.pictures import NO_VALUE, Scale, indexed_png, palet
 from tofcapture_model.report.rigs import origin_of_alignment, transforms
 from tofcapture_model.report.scores import headline, tables
 from tofcapture_model.report.training import loss_chart, read_metrics
+from tofcapture_model.zoo import build_model
 
 CAMERA = Camera(64, 48, 50.0, 52.0, 31.0, 24.5)
 SECTIONS = ("numbers", "examples", "alignment", "rig", "made", "limits")
@@ -295,7 +296,7 @@ def test_names_are_escaped(tmp_path):
     shard.chmod(0o644)
     with h5py.File(shard, "r+") as file:
         file.attrs["scene"] = EVIL
-    write_manifest(dataset, Manifest({EVIL: SceneEntry("shards/one.h5", "0", 1, "test")}))
+    write_manifest(dataset, Manifest({EVIL: SceneEntry("shards/one.h5", sha256_of(shard), 1, "test")}))
     (tmp_path / "r.json").write_text(json.dumps(results_table(EVIL)))
     evidence = evidence_table()
     evidence["pairs"][3]["reason"] = "<u>because</u>"

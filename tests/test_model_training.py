@@ -283,7 +283,6 @@ def test_the_paper_s_stages_run_in_order(dataset, tiny, tmp_path):
     config = replace(
         paper,
         network=Network(width=2, levels=3, refine_iterations=1),
-        losses=replace(paper.losses, chamfer_radius=2),
         training=replace(tiny.training, schedule="constant"),
         stages=(Stage("depth", 1), Stage("normal", 1), Stage("refine", 1)),
     )

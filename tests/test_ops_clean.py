@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
-from tofcapture.ops.crop import Crop, crop_depth, dominant_plane, find_crop, inside
+from tofcapture.ops.crop import LOWEST_SMOOTH, Crop, crop_depth, dominant_plane, find_crop, inside, lowered
 from tofcapture.ops.denoise import SPIKE_PIXELS, SPIKE_SIGMAS, STEEPEST, SUPPORT, denoise
 from tofcapture.ops.register import register
 from tofcapture.poses import exp, transform_points
@@ -196,6 +196,29 @@ def test_without_a_table_everything_within_range_stays():
     np.testing.assert_array_equal(inside(crop, points), points[:, 2] < 1.2)
     assert not inside(crop, np.full((2, 3), np.nan)).any()
     assert find_crop(np.full((4, 4, 3), np.nan), UP, rng()).far == 2.0
+
+
+def test_a_crop_of_a_hundred_metres_is_none():
+    """Without a crop no table is looked for: what lies on a perfect one stays."""
+    points = np.concatenate(
+        [np.random.default_rng(0).uniform(-0.3, 0.3, (500, 2)), np.ones((500, 1))], axis=1
+    )
+    assert np.isfinite(find_crop(points, UP, rng(), radius=99.0).offset)
+    crop = find_crop(points, UP, rng(), radius=100.0)
+    assert np.isnan(crop.offset)
+    assert inside(crop, points).all()
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.0001, 0.0002, 0.001])
+def test_smoothed_points_lower_the_crop_to_their_own_scatter(scatter):
+    """Four standard deviations of the table, never less than a quarter of a millimetre, never more than before."""
+    points = np.random.default_rng(0).normal(0, 1, (4000, 3)) * [0.1, 0.1, scatter] + [0, 0, 1]
+    points[:800, 2] -= 0.05  # an object
+    crop = Crop(np.array([0, 0, -1.0]), -1.0, np.array([0, 0, 1.0]), 0.35, 0.0012, 2.0)
+    low = lowered(crop, points).clearance
+    assert low == pytest.approx(min(0.0012, max(LOWEST_SMOOTH, 4 * scatter)), rel=0.1)
+    assert lowered(crop, points[:300]) == crop  # too few to tell
+    assert not np.isfinite(lowered(find_crop(points, UP, rng(), 1e3), points).offset)
 
 
 def test_the_same_generator_gives_the_same_crop():

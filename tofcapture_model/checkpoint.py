@@ -18,7 +18,7 @@ from torch import Tensor
 
 from tofcapture.errors import ConfigError, FormatError
 from tofcapture_model.config import Config, dumps_config, loads_config
-from tofcapture_model.joint import JointModel, build_model
+from tofcapture_model.zoo import Model, build_model
 
 FORMAT, VERSION = "tofcapture-model", 1
 
@@ -56,7 +56,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         ) from err
 
 
-def save_model(path: Path, model: JointModel, config: Config, provenance: Mapping[str, Any]) -> Path:
+def save_model(path: Path, model: Model, config: Config, provenance: Mapping[str, Any]) -> Path:
     """Write weights and configuration; ``provenance`` is any JSON object (dataset digests, steps, metrics)."""
     text = dumps_config(config)
     header = {
@@ -82,7 +82,7 @@ def find_model(path: Path | None) -> Path:
     return Path(path) / "model.safetensors" if Path(path).is_dir() else Path(path)
 
 
-def load_model(path: Path | None) -> tuple[JointModel, Config, dict[str, Any]]:
+def load_model(path: Path | None) -> tuple[Model, Config, dict[str, Any]]:
     """Load a model, strictly: a missing or an additional weight is an error.
 
     Parameters
@@ -111,7 +111,7 @@ def load_model(path: Path | None) -> tuple[JointModel, Config, dict[str, Any]]:
     return model.eval(), config, json.loads(header.get("provenance", "{}"))
 
 
-def load_strictly(model: JointModel, tensors: Mapping[str, Tensor], path: Path) -> None:
+def load_strictly(model: Model, tensors: Mapping[str, Tensor], path: Path) -> None:
     """Copy tensors into a model; names and shapes must agree exactly."""
     try:
         model.load_state_dict(dict(tensors), strict=True)
@@ -121,7 +121,7 @@ def load_strictly(model: JointModel, tensors: Mapping[str, Tensor], path: Path) 
 
 def save_resume(
     path: Path,
-    model: JointModel,
+    model: Model,
     optimizer: torch.optim.Optimizer,
     names: Mapping[int, str],
     state: Mapping[str, Any],

@@ -12,6 +12,7 @@ from tofcapture.command import Command, Outcome
 from tofcapture.errors import ConfigError
 from tofcapture_model.config import Config, load_config, preset, presets
 from tofcapture_model.progress import progress
+from tofcapture_model.tables import SUITES
 
 
 def _share_cores() -> None:
@@ -109,31 +110,66 @@ def _train(args: argparse.Namespace) -> Outcome:
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", type=Path, help="folder that build-dataset wrote")
     parser.add_argument(
-        "--weights", type=Path, help="checkpoint or folder of a run (default: the bundled weights)"
+        "--weights",
+        nargs="+",
+        metavar="[NAME=]PATH",
+        help="checkpoint or folder of a run (default: the bundled weights); with --suite, NAME=PATH of several",
     )
+    parser.add_argument(
+        "--suite",
+        choices=(*SUITES, "all"),
+        help="tables of several methods, written beside --out (docs/network.md)",
+    )
+    parser.add_argument("--scenes", default="", help="with --suite: only scenes whose name begins so")
     parser.add_argument("--out", type=Path, default=Path("results.json"), help="default: results.json")
     parser.add_argument("--split", choices=("train", "val", "test"), default="test", help="default: test")
     parser.add_argument(
-        "--frames", type=int, default=1, help="frames of every view; 0 takes all (default: 1)"
+        "--frames", type=int, help="frames of every view; 0 takes all (default: 1, with --suite all)"
     )
     _device(parser)
 
 
 def _evaluate(args: argparse.Namespace) -> Outcome:
     _share_cores()
+    if args.suite:
+        return _suite(args)
     from tofcapture_model.evaluate import comparison, evaluate
 
+    if args.weights and (len(args.weights) > 1 or "=" in args.weights[0]):
+        raise ConfigError(
+            "several --weights need a --suite", hint="tofcapture evaluate DATASET --suite main ..."
+        )
     with progress() as report:
         results = evaluate(
             args.dataset,
-            args.weights,
+            Path(args.weights[0]) if args.weights else None,
             args.out,
             split=args.split,
-            frames=args.frames,
+            frames=1 if args.frames is None else args.frames,
             device=_checked_device(args.device),
             progress=lambda done, total: report("evaluate", done / total),
         )
     return Outcome({**results, "results": str(args.out)}, f"{comparison(results)}\n{args.out}")
+
+
+def _suite(args: argparse.Namespace) -> Outcome:
+    from tofcapture_model.suite import read_weights, run_suite
+    from tofcapture_model.tables import markdown
+
+    with progress() as report:
+        results = run_suite(
+            args.dataset,
+            args.suite,
+            read_weights(args.weights or []),
+            args.out,
+            split=args.split,
+            frames=args.frames or 0,
+            scenes=args.scenes,
+            device=_checked_device(args.device),
+            progress=lambda done, total: report("evaluate", done / total),
+        )
+    names = list(SUITES) if args.suite == "all" else [args.suite]
+    return Outcome({**results, "results": str(args.out)}, f"{markdown(results, names)}\n{args.out}")
 
 
 def _configure_predict(parser: argparse.ArgumentParser) -> None:
@@ -151,6 +187,12 @@ def _configure_predict(parser: argparse.ArgumentParser) -> None:
         "--average", action="store_true", help="take the mean of the burst instead of one frame"
     )
     parser.add_argument("--rig", type=Path, help="rig.toml for a .npy (default: nominal intrinsics)")
+    parser.add_argument(
+        "--backend",
+        choices=("torch", "onnx"),
+        default="torch",
+        help="onnx: the model.onnx beside the weights (default: torch)",
+    )
     _device(parser)
 
 
@@ -166,10 +208,42 @@ def _predict(args: argparse.Namespace) -> Outcome:
         frame=None if args.average else args.frame,
         rig=args.rig,
         device=_checked_device(args.device),
+        backend=args.backend,
     )
     size = " x ".join(str(n) for n in reversed(result["shape"]))
     text = f"{args.out}: depth, normals and expected error at {size}, network took {result['inference_ms']:.0f} ms"
     return Outcome(result, text)
+
+
+def _configure_export(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--weights", type=Path, help="checkpoint or folder of a run (default: the bundled weights)"
+    )
+    parser.add_argument("--out", type=Path, help="default: beside the weights, .onnx or .pt2")
+    parser.add_argument(
+        "--format", choices=("onnx", "torch"), default="onnx", help="torch: torch.export (default: onnx)"
+    )
+    parser.add_argument(
+        "--size",
+        type=_count,
+        nargs=2,
+        metavar=("HEIGHT", "WIDTH"),
+        default=(180, 240),
+        help="of the sensor (default: 180 240)",
+    )
+
+
+def _export(args: argparse.Namespace) -> Outcome:
+    _share_cores()
+    from tofcapture_model.checkpoint import find_model
+    from tofcapture_model.export import export
+
+    out = args.out or find_model(args.weights).with_suffix(".onnx" if args.format == "onnx" else ".pt2")
+    result = export(args.weights, out, kind=args.format, size=(args.size[0], args.size[1]))
+    worst = max(result["differences"].values())
+    return Outcome(
+        result, f"{out}: {result['bytes'] / 1e6:.1f} MB, differs from torch by {worst:.1g} at most"
+    )
 
 
 def _configure_report(parser: argparse.ArgumentParser) -> None:
@@ -206,6 +280,12 @@ PREDICT = Command(
     "tofcapture predict recording/views/mug/view-000.h5 --out prediction",
     _configure_predict,
     _predict,
+)
+EXPORT = Command(
+    "write a trained model for other runtimes",
+    "tofcapture export --weights run --out model.onnx",
+    _configure_export,
+    _export,
 )
 REPORT = Command(
     "write one HTML page with tables and pictures",

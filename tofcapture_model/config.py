@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 from tofcapture.errors import ConfigError
 
 STAGES = ("depth", "normal", "refine", "joint")
+OURS, BASELINES = ("paper", "compact"), ("su2018", "guo2018", "coarse-fine")
 SOURCES = {"raw": 8, "confidence": 1, "depth": 1}
 
 
@@ -33,7 +34,9 @@ class Network:
     Attributes
     ----------
     kind
-        ``paper``: three U-Nets; ``compact``: one small U-Net with three heads on classical features.
+        ``paper``: three U-Nets; ``compact``: one small U-Net with three heads on classical features; ``su2018``, ``guo2018``,
+        ``coarse-fine``: published networks (:mod:`tofcapture_model.baselines`), of which ``su2018`` has a width and none has
+        any of the other keys.
     width, levels
         Channels of the first level and number of levels of every U-Net.
     inputs
@@ -42,6 +45,8 @@ class Network:
         Radii in pixels of the side-window plane fits that ``compact`` reads.
     max_residual
         Metres by which the network may move a depth beyond its candidates; 0: any distance.
+    learned_upsampling
+        Depth by learned convex x2 upsampling; false: bilinear.
     refine_iterations, refine_radius
         Depth-normal-depth rounds, and taps to each side of the propagation window at twice the resolution.
     """
@@ -52,11 +57,12 @@ class Network:
     inputs: tuple[str, ...] = ("raw", "confidence", "depth")
     windows: tuple[int, ...] = (2, 4)
     max_residual: float = 0.0
+    learned_upsampling: bool = True
     refine_iterations: int = 2
     refine_radius: int = 2
 
     def __post_init__(self) -> None:
-        _require(self.kind in ("paper", "compact"), "network.kind", "paper or compact", self.kind)
+        _require(self.kind in OURS + BASELINES, "network.kind", ", ".join(OURS + BASELINES), self.kind)
         _require(
             self.width > 0 and 2 <= self.levels <= 6,
             "network",
@@ -89,8 +95,11 @@ class Losses:
         Metres, threshold of eq. 1.
     jitter
         Metres, of the robust Chamfer loss (eq. 2).
-    chamfer_radius
-        Pixels of the search window at twice the resolution; 0: as wide as the jitter needs.
+    reweight
+        Whether eq. 1 weighs pixels by lambda; false: plain smooth l1.
+    uncertainty
+        What the error map learns: ``l1``, the expected absolute error (paper), or ``laplace``, the scale of a Laplace
+        distribution, which is then calibrated on the ``val`` split to be one sigma.
     depth, chamfer, error, normal
         Weights of eq. 1, eq. 2 (in 1/mm^2), the error map, eq. 3.
     context
@@ -99,7 +108,8 @@ class Losses:
 
     delta: float = 0.020
     jitter: float = 0.010
-    chamfer_radius: int = 0
+    reweight: bool = True
+    uncertainty: str = "l1"
     depth: float = 1.0
     chamfer: float = 0.01
     error: float = 1.0
@@ -109,6 +119,9 @@ class Losses:
     def __post_init__(self) -> None:
         _require(
             self.delta > 0 and self.jitter >= 0, "losses", "delta > 0, jitter >= 0", (self.delta, self.jitter)
+        )
+        _require(
+            self.uncertainty in ("l1", "laplace"), "losses.uncertainty", "l1 or laplace", self.uncertainty
         )
         _require(
             min(self.depth, self.chamfer, self.error, self.normal, self.context) >= 0,
@@ -154,6 +167,10 @@ class Training:
         ``constant`` (paper) or ``cosine`` down to zero over each stage.
     validate_every
         Epochs between validations; 0: only at the end of each stage.
+    precision
+        ``float32``, or ``bfloat16`` for the convolutions; geometry and losses stay in float32. For GPUs with tensor cores.
+    compile
+        Compile the model (``torch.compile``): minutes at the start, and faster steps after.
     seed
         Of weights, order and crops.
     """
@@ -164,10 +181,18 @@ class Training:
     flip: bool = False
     schedule: str = "constant"
     validate_every: int = 0
+    precision: str = "float32"
+    compile: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
         _require(self.batch > 0, "training.batch", "> 0", self.batch)
+        _require(
+            self.precision in ("float32", "bfloat16"),
+            "training.precision",
+            "float32 or bfloat16",
+            self.precision,
+        )
         _require(self.frames >= 0, "training.frames", ">= 0", self.frames)
         _require(
             len(self.crop) in (0, 2) and all(c >= 32 for c in self.crop),
@@ -197,6 +222,8 @@ class Config:
         split = [s.name for s in self.stages if s.name in ("depth", "normal")]
         _require(len(self.stages) > 0, "stages", "at least one", "none")
         _require(not (shared and split), "stages", "joint or refine, as compact shares its backbone", split)
+        foreign = [s.name for s in self.stages if self.network.kind in BASELINES and s.name != "depth"]
+        _require(not foreign, "stages", f"depth only, as {self.network.kind} answers with depth", foreign)
         idle = self.network.refine_iterations == 0 and any(s.name == "refine" for s in self.stages)
         _require(not idle, "stages", "no refine stage without refine_iterations", "refine")
 
@@ -296,7 +323,7 @@ def presets() -> tuple[str, ...]:
 
 
 def preset(name: str) -> Config:
-    """Load a shipped preset: ``paper``, ``compact`` or ``demo``."""
+    """Load a shipped preset, one of :func:`presets`."""
     if name not in presets():
         raise ConfigError(f"expected a preset of {', '.join(presets())}, got {name!r}")
     text = (files("tofcapture_model") / "presets" / f"{name}.toml").read_text(encoding="utf-8")

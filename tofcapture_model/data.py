@@ -17,7 +17,7 @@ from tofcapture.errors import DataError
 from tofcapture.files.layout import MaskBit
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoded, ambiguity, decode, frequencies, phasors
-from tofcapture_model.frame import Frame, Target
+from tofcapture_model.frame import NO_MAPS, Frame, Target
 from tofcapture_model.multipath import cues
 from tofcapture_model.shards import SampleId, all_samples, open_scenes
 
@@ -77,7 +77,8 @@ def make_frame(raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float 
         confidence=_tensor(decoded.confidence[None] / info.saturation),
         gap=_tensor(gap[None]),
         cues=torch.empty(0),
-        intrinsics=torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy]),
+        modulation=torch.tensor(frequencies(info.modulation_hz), dtype=torch.float32),
+        intrinsics=torch.tensor([camera.pinhole("network input").fx, camera.fy, camera.cx, camera.cy]),
     )
     whole = batched(frame)
     high = frequencies(info.modulation_hz)[1]
@@ -106,20 +107,21 @@ def crop(frame: Frame, target: Target, top: int, left: int, size: tuple[int, int
     """Cut a window out of a frame and its target; the principal point moves with it."""
     rows, cols = slice(top, top + size[0]), slice(left, left + size[1])
     rows2, cols2 = slice(2 * top, 2 * (top + size[0])), slice(2 * left, 2 * (left + size[1]))
-    maps = {k: v[..., rows, cols] for k, v in frame._asdict().items() if k != "intrinsics"}
+    maps = {k: v[..., rows, cols] for k, v in frame._asdict().items() if k not in NO_MAPS}
     shift = torch.tensor([0.0, 0.0, float(left), float(top)])
-    return Frame(**maps, intrinsics=frame.intrinsics - shift), Target(*(x[..., rows2, cols2] for x in target))
+    cut = frame._replace(**maps, intrinsics=frame.intrinsics - shift)
+    return cut, Target(*(x[..., rows2, cols2] for x in target))
 
 
 def mirror(frame: Frame, target: Target, axis: int = -1) -> tuple[Frame, Target]:
     """Flip left and right (axis -1) or up and down (axis -2): images, principal point, and that component of the normals."""
-    maps = {k: v.flip(axis) for k, v in frame._asdict().items() if k != "intrinsics"}
+    maps = {k: v.flip(axis) for k, v in frame._asdict().items() if k not in NO_MAPS}
     intrinsics, sign = frame.intrinsics.clone(), torch.ones(3, 1, 1)
     component = -1 - axis  # x for columns, y for rows
     intrinsics[2 + component] = frame.depth.shape[axis] - 1 - intrinsics[2 + component]
     sign[component] = -1
     flipped = Target(*(x.flip(axis) for x in target))
-    return Frame(**maps, intrinsics=intrinsics), flipped._replace(normals=flipped.normals * sign)
+    return frame._replace(**maps, intrinsics=intrinsics), flipped._replace(normals=flipped.normals * sign)
 
 
 class FrameDataset(Dataset[tuple[Frame, Target]]):
@@ -230,11 +232,9 @@ def collate(items: Sequence[tuple[Frame, Target]]) -> tuple[Frame, Target]:
     maps = {
         k: v.contiguous(memory_format=torch.channels_last)
         for k, v in frame._asdict().items()
-        if k != "intrinsics"
+        if k not in NO_MAPS
     }
-    return Frame(**maps, intrinsics=frame.intrinsics), Target(
-        *(torch.stack(x) for x in zip(*targets, strict=True))
-    )
+    return frame._replace(**maps), Target(*(torch.stack(x) for x in zip(*targets, strict=True)))
 
 
 def batched(frame: Frame) -> Frame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -11,20 +12,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tofcapture.files.manifest import load_manifest
 from tofcapture_model.baselines import sensor
 from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.data import FrameDataset, batched
 from tofcapture_model.frame import Frame, frame_to, target_to
 from tofcapture_model.joint import JointModel
 from tofcapture_model.metrics import Score
+from tofcapture_model.shards import SampleId
+from tofcapture_model.zoo import Model
 
 FORMAT, VERSION = "tofcapture-results", 1
+_EVERY = 7  # of how many good pixels a calibration looks at one
 
 Method = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
 """Depth (B, 1, 2H, 2W), normals (B, 3, 2H, 2W), and where the method answers by itself."""
 
 
-def model_method(model: JointModel) -> Method:
+def model_method(model: Model) -> Method:
     """Wrap a model as a method; it answers everywhere."""
 
     def answer(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
@@ -61,6 +66,49 @@ def score(
         if progress:
             progress(i + 1, len(dataset.samples))
     return scores, empty
+
+
+ONE_SIGMA = 0.6827  # share of errors within one sigma
+LAPLACE_SIGMA = -math.log(1 - ONE_SIGMA)  # in units of the scale of a Laplace distribution
+
+
+@torch.no_grad()
+def calibrate(model: JointModel, dataset: Path, device: torch.device) -> dict[str, Any]:
+    """Scale the error map of a model so that it holds 68 % of the errors on the first frames of the ``val`` split.
+
+    Without such a split the factor is that of an exact Laplace distribution. The factor is a buffer and goes into checkpoints.
+
+    Returns
+    -------
+    ``factor``, and ``views`` that it was fitted on
+    """
+    if not load_manifest(dataset).split("val"):
+        model.error_map.calibration.mul_(LAPLACE_SIGMA)
+        return {"factor": float(model.error_map.calibration), "views": 0}
+    data = FrameDataset(dataset, "val", frames=1, cache_bytes=0)
+    model.eval()
+    for _ in range(
+        2
+    ):  # the refinement weighs by the error map, so that the depth moves a little with the factor
+        ratios = torch.cat([_ratios(model, data, sample, device) for sample in data.samples])
+        if len(ratios):
+            model.error_map.calibration.mul_(
+                float(ratios.kthvalue(max(int(ONE_SIGMA * len(ratios)), 1)).values)
+            )
+    model.train()
+    data.close()
+    return {"factor": float(model.error_map.calibration), "views": len(data.samples)}
+
+
+def _ratios(model: JointModel, data: FrameDataset, sample: SampleId, device: torch.device) -> Tensor:
+    """Errors in units of the predicted ones at some good pixels of a frame, on the CPU."""
+    found, target = (
+        model(frame_to(batched(data.frame(sample)), device)),
+        target_to(data.target(sample), device),
+    )
+    ratio = (found.depth - target.depth[None]).abs() / found.error.clamp_min(1e-9)
+    kept: Tensor = ratio[target.good[None]][::_EVERY].cpu()
+    return kept
 
 
 def evaluate(
@@ -119,11 +167,12 @@ def evaluate(
         "methods": {name: s.table() for name, s in scores.items()},
     }
     data.close()
-    _write(Path(out), results)
+    write_results(Path(out), results)
     return results
 
 
-def _write(path: Path, results: dict[str, Any]) -> None:
+def write_results(path: Path, results: dict[str, Any]) -> None:
+    """Write ``results.json`` atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
     with partial.open("w", encoding="utf-8") as file:

@@ -27,6 +27,8 @@ class Frame(NamedTuple):
         (B, 1, H, W) range of the low minus range of the high frequency, metres: the multipath cue.
     cues
         (B, 4, H, W) depth errors that physics expects, metres: see :func:`tofcapture_model.multipath.cues`.
+    modulation
+        (B, 2) low and high modulation frequency, Hz.
     intrinsics
         (B, 4) fx, fy, cx, cy in pixels of the (H, W) grid.
     """
@@ -38,7 +40,12 @@ class Frame(NamedTuple):
     confidence: Tensor
     gap: Tensor
     cues: Tensor
+    modulation: Tensor
     intrinsics: Tensor
+
+
+NO_MAPS = frozenset({"modulation", "intrinsics"})
+"""Fields of a frame that have no pixels: neither cropped nor mirrored."""
 
 
 class Target(NamedTuple):

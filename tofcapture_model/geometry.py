@@ -7,7 +7,6 @@ All functions keep the dtype they are given; the project calls them in float32.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -57,7 +56,6 @@ def offsets(radius: int, step: int = 1) -> Iterator[tuple[int, int]]:
     return ((dy, dx) for dy in reach for dx in reach if (dy, dx) != (0, 0))
 
 
-@lru_cache(maxsize=16)
 def _moment_filters(radius: int) -> Tensor:
     """(6, 1, k, k) weights 1, u, v, uu, uv, vv of a window."""
     r = torch.arange(-radius, radius + 1, dtype=torch.float64)
@@ -88,9 +86,10 @@ def local_planes(depth: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Ten
     origin = inverse.mean(dim=(2, 3), keepdim=True)  # float32 moments cancel badly far from zero
     i = (inverse - origin) * valid
     bank = _moment_filters(radius).to(depth)
-    s1, su, sv, suu, suv, svv = F.conv2d(valid, bank, padding=radius).unbind(1)
-    t1, tu, tv = F.conv2d(i, bank[:3], padding=radius).unbind(1)
-    tt = F.conv2d(i * (inverse - origin), bank[:1], padding=radius)[:, 0]
+    with torch.autocast(depth.device.type, enabled=False):  # eight bits of mantissa hold no moments
+        s1, su, sv, suu, suv, svv = F.conv2d(valid, bank, padding=radius).unbind(1)
+        t1, tu, tv = F.conv2d(i, bank[:3], padding=radius).unbind(1)
+        tt = F.conv2d(i * (inverse - origin), bank[:1], padding=radius)[:, 0]
     # a window with one row or column of pixels has a slope of zero across it
     ridge = 10 * torch.finfo(depth.dtype).eps * suu + _TINY
     n = s1.clamp_min(_TINY)

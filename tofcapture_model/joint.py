@@ -1,24 +1,16 @@
-"""The whole model: ToF raw data in, depth, error map and normals at twice the resolution out."""
+"""Our model: ToF raw data in, depth, error map and normals at twice the resolution out."""
 
 from __future__ import annotations
 
-import torch
 from torch import nn
 from torch.nn import functional as F  # noqa: N812
 
-from tofcapture_model.config import Config, Network
+from tofcapture_model.config import Network
 from tofcapture_model.frame import Estimate, Frame
 from tofcapture_model.geometry import scale_intrinsics
 from tofcapture_model.networks import CompactInputs, ErrorMap, PaperInputs, Raw2Depth, Raw2Normal
 from tofcapture_model.refine import Refinement
 from tofcapture_model.unet import UNet
-
-PARTS = {
-    "depth": ("raw2depth", "error_map"),
-    "normal": ("raw2normal",),
-    "refine": ("refinement",),
-    "joint": ("backbone", "raw2depth", "error_map", "raw2normal", "refinement"),
-}
 
 
 class JointModel(nn.Module):
@@ -76,17 +68,3 @@ class JointModel(nn.Module):
             depth, normals, error, scale_intrinsics(frame.intrinsics, 2)
         )
         return Estimate(fine_depth, fine_normals, error, depth, normals)
-
-
-def build_model(config: Config) -> JointModel:
-    """Build the model of a configuration, in channels-last memory order (a third faster on CPU)."""
-    return JointModel(config.network).to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
-
-
-def select_stage(model: JointModel, stage: str) -> list[nn.Parameter]:
-    """Freeze all parameters but those that learn in ``stage``; return these."""
-    learning = []
-    for name, parameter in model.named_parameters():
-        parameter.requires_grad_(name.split(".")[0] in PARTS[stage])
-        learning += [parameter] if parameter.requires_grad else []
-    return learning

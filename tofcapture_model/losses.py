@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tofcapture_model.chamfer import Chamfer, robust_chamfer, search_radius
+from tofcapture_model.chamfer import Chamfer, robust_chamfer
 from tofcapture_model.config import Losses
 from tofcapture_model.frame import Estimate, Target
 from tofcapture_model.geometry import unit, unproject
@@ -19,6 +19,7 @@ _PER_MM2 = 1e6  # m^2 to mm^2, so that the Chamfer weight is of the order of the
 DELTA = 0.020  # m, paper: threshold 20 (mm) of eq. 1
 EPSILON = 1e-6  # m, paper: 0.001 (mm) in lambda = d / (e + epsilon)
 MIN_ERROR = 0.001  # m; see reweighting()
+MIN_SCALE = 1e-4  # m; the likelihood of a perfect pixel has no bound
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -78,6 +79,21 @@ def error_map_loss(error: Tensor, depth: Tensor, gt: Tensor, mask: Tensor, delta
     return masked_mean((error.float() - truth).abs() / delta, mask)
 
 
+def laplace_loss(scale: Tensor, depth: Tensor, gt: Tensor, mask: Tensor, delta: float = DELTA) -> Tensor:
+    """Negative log likelihood of the detached depth under a Laplace distribution, mean over the mask; may be negative.
+
+    Parameters
+    ----------
+    scale
+        (B, 1, H, W) metres, positive: predicted scale b; the sigma of the distribution is ``sqrt(2) b``.
+    depth, gt, mask, delta
+        As in :func:`error_map_loss`; delta is the unit of the scale.
+    """
+    truth = (depth.detach().float() - _inside(gt, mask, depth)).abs()
+    scale = scale.float().clamp_min(MIN_SCALE)
+    return masked_mean(truth / scale + (scale / delta).log(), mask)
+
+
 def cosine_loss(normals: Tensor, gt: Tensor, mask: Tensor) -> Tensor:
     """Cosine embedded loss (eq. 3): mean of ``1 - n1 . n2 / (|n1| |n2|)`` over the mask.
 
@@ -127,11 +143,15 @@ def objective(
     parts: dict[str, Tensor] = {}
     winners = torch.zeros(7)
     if stage != "normal":
+        lambda_error = (
+            estimate.error if weights.reweight else target.depth
+        )  # lambda = d / d is the same everywhere
         parts["depth"] = weights.depth * reweighted_smooth_l1(
-            depth, target.depth, estimate.error, weight, weights.delta
+            depth, target.depth, lambda_error, weight, weights.delta
         )
     if stage in ("depth", "joint"):
-        parts["error"] = weights.error * error_map_loss(
+        uncertainty = laplace_loss if weights.uncertainty == "laplace" else error_map_loss
+        parts["error"] = weights.error * uncertainty(
             estimate.error, depth, target.depth, weight, weights.delta
         )
         if weights.chamfer:
@@ -145,9 +165,5 @@ def objective(
 
 def _chamfer(weights: Losses, depth: Tensor, target: Target, intrinsics: Tensor) -> Chamfer:
     """Robust Chamfer between the clouds over the good pixels (both clouds live where the ground truth does)."""
-    radius = weights.chamfer_radius
-    if not radius:
-        nearest = target.depth.where(target.good, torch.inf).min().clamp(0.2, 10.0)
-        radius = search_radius(float(intrinsics[:, :2].max()), float(nearest), weights.jitter)
     p, q = unproject(depth, intrinsics), unproject(target.depth, intrinsics)
-    return robust_chamfer(p, q, target.good, target.good, radius, weights.jitter)
+    return robust_chamfer(p, q, target.good, target.good, intrinsics, weights.jitter)

@@ -120,7 +120,7 @@ class Raw2Depth(nn.Module):
     def __init__(self, network: Network, channels: int) -> None:
         super().__init__()
         self.candidates = len(network.windows) + len(CUE_SCALE) if network.kind == "compact" else 0
-        self.max_residual = network.max_residual
+        self.max_residual, self.learned = network.max_residual, network.learned_upsampling
         self.net = _head(network, channels, self.candidates + 1 + CONVEX_CHANNELS)
         self.register_buffer("bilinear", bilinear_logits().reshape(1, -1, 1, 1), persistent=False)
         self.bilinear: Tensor
@@ -130,7 +130,8 @@ class Raw2Depth(nn.Module):
         gates, residual, logits = self.net(shared).float().split([self.candidates, 1, CONVEX_CHANNELS], dim=1)
         steps = (gates * (features.candidates - frame.depth)).sum(1, keepdim=True)
         depth = frame.depth + steps + self._bounded(residual * RESIDUAL_UNIT)
-        return convex_upsample(depth.clamp_min(0.05), logits + self.bilinear)
+        learned = logits if self.learned else torch.zeros_like(logits)
+        return convex_upsample(depth.clamp_min(0.05), learned + self.bilinear)
 
     def _bounded(self, residual: Tensor) -> Tensor:
         limit = self.max_residual
@@ -143,12 +144,14 @@ class ErrorMap(nn.Module):
     def __init__(self, network: Network, channels: int) -> None:
         super().__init__()
         self.net = _head(network, channels + 4, 4)
+        self.register_buffer("calibration", torch.ones(()))  # set after training, see evaluate.calibrate
+        self.calibration: Tensor
 
     def forward(self, shared: Tensor, depth: Tensor, frame: Frame) -> Tensor:
         """Return (B, 1, 2H, 2W), metres, positive."""
         change = F.pixel_unshuffle(depth.detach(), 2) - frame.depth
         out = self.net(torch.cat([shared, (change * 20).clamp(-2, 2)], dim=1)).float()
-        return F.softplus(F.pixel_shuffle(out, 2)) * RESIDUAL_UNIT
+        return F.softplus(F.pixel_shuffle(out, 2)) * (RESIDUAL_UNIT * self.calibration)
 
 
 class Raw2Normal(nn.Module):

@@ -6,6 +6,7 @@ import statistics
 import struct
 import time
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
@@ -21,7 +23,7 @@ from tofcapture.frames import TofInfo
 from tofcapture.rig import load_rig
 from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.data import batched, make_frame
-from tofcapture_model.frame import Estimate, frame_to
+from tofcapture_model.frame import Frame, frame_to
 
 Float32 = NDArray[np.float32]
 RUNS = 3  # timed inferences, of which the median is told
@@ -134,7 +136,9 @@ def read_input(path: Path, view: int = 0, rig: Path | None = None) -> RawInput:
     return _from_npy(path, rig) if path.suffix == ".npy" else _from_h5(path, view)
 
 
-def predict_raw(data: RawInput, frame: int | None, weights: Path | None, device: str = "cpu") -> Prediction:
+def predict_raw(
+    data: RawInput, frame: int | None, weights: Path | None, device: str = "cpu", backend: str = "torch"
+) -> Prediction:
     """Run a model on one frame of a burst, or with ``frame = None`` on the burst's mean (taps are linear, so it may be taken).
 
     Parameters
@@ -147,33 +151,67 @@ def predict_raw(data: RawInput, frame: int | None, weights: Path | None, device:
         Checkpoint; ``None``: the bundled one.
     device
         Torch device.
+    backend
+        ``torch``, or ``onnx`` for the ``model.onnx`` that lies beside the checkpoint.
     """
     if frame is not None and not 0 <= frame < len(data.raw):
         raise ConfigError(f"expected a frame of 0 to {len(data.raw) - 1}, got {frame}")
     taken = slice(None) if frame is None else slice(frame, frame + 1)
     raw, celsius = data.raw[taken].mean(axis=0, dtype=np.float64), float(data.celsius[taken].mean())
-    model, _, _ = load_model(weights)
-    model.to(device)
+    ask = _onnx_model(weights, data.camera) if backend == "onnx" else _torch_model(weights, device)
     started = time.perf_counter()
     inputs = frame_to(batched(make_frame(raw, data.info, data.camera, celsius)), torch.device(device))
     decode_ms = 1000 * (time.perf_counter() - started)
     times: list[float] = []
     with torch.inference_mode():
-        estimate: Estimate = model(inputs)  # the first run allocates
+        depth, normals, error = ask(inputs)  # the first run allocates
         for _ in range(RUNS):
             started = time.perf_counter()
-            estimate = model(inputs)
+            depth, normals, error = ask(inputs)
             if device.startswith("cuda"):
                 torch.cuda.synchronize()
             times.append(1000 * (time.perf_counter() - started))
     return Prediction(
-        depth=estimate.depth[0, 0].cpu().numpy(),
-        error=estimate.error[0, 0].cpu().numpy(),
-        normals=np.ascontiguousarray(estimate.normals[0].permute(1, 2, 0).cpu().numpy()),
+        depth=depth[0, 0].cpu().numpy(),
+        error=error[0, 0].cpu().numpy(),
+        normals=np.ascontiguousarray(normals[0].permute(1, 2, 0).cpu().numpy()),
         camera=data.camera.scaled(2),
         inference_ms=statistics.median(times),
         decode_ms=decode_ms,
     )
+
+
+Ask = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
+
+
+def _torch_model(weights: Path | None, device: str) -> Ask:
+    model = load_model(weights)[0].to(device)
+
+    def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        found = model(frame)
+        return found.depth, found.normals, found.error
+
+    return ask
+
+
+def _onnx_model(weights: Path | None, camera: Camera) -> Ask:
+    from tofcapture_model.onnx_backend import ask_onnx, open_onnx
+
+    path = find_model(weights).with_suffix(".onnx")
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file", hint="tofcapture export --weights ... writes it")
+    session = open_onnx(path)
+    size = tuple(session.get_inputs()[0].shape[-2:])
+    if size != camera.shape:
+        raise ConfigError(
+            f"{path}: exported for frames of {size}, got {camera.shape}", hint="tofcapture export --size"
+        )
+
+    def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        depth, normals, error = (torch.from_numpy(x) for x in ask_onnx(session, frame))
+        return depth, normals, error
+
+    return ask
 
 
 def png_bytes(image: NDArray[Any]) -> bytes:
@@ -236,10 +274,11 @@ def predict(
     frame: int | None = 0,
     rig: Path | None = None,
     device: str = "cpu",
+    backend: str = "torch",
 ) -> dict[str, Any]:
     """Predict from a file and write the result; returns what ``--json`` prints."""
     data = read_input(Path(path), view, rig)
-    prediction = predict_raw(data, frame, weights, device)
+    prediction = predict_raw(data, frame, weights, device, backend)
     written = write_prediction(prediction, Path(out))
     return {
         "input": str(path),

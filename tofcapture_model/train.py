@@ -22,12 +22,11 @@ from tofcapture.files.seal import sha256_of
 from tofcapture_model.checkpoint import load_resume, load_strictly, save_model, save_resume
 from tofcapture_model.config import Config, Stage, dumps_config
 from tofcapture_model.data import FrameDataset, collate, epoch_batches
-from tofcapture_model.evaluate import model_method, score
-from tofcapture_model.frame import frame_to, target_to
-from tofcapture_model.geometry import scale_intrinsics
-from tofcapture_model.joint import JointModel, build_model, select_stage
-from tofcapture_model.losses import objective
+from tofcapture_model.evaluate import calibrate, model_method, score
+from tofcapture_model.frame import Estimate, frame_to, target_to
+from tofcapture_model.joint import JointModel
 from tofcapture_model.runlog import Log, Position
+from tofcapture_model.zoo import Model, build_model, select_stage, training_loss
 
 SAVE_EVERY = 60.0  # s between resume points
 LOG_EVERY = 20  # steps
@@ -132,6 +131,8 @@ def train(
             optimizer = torch.optim.Adam(learning, lr=stage.learning_rate)
             _restore(optimizer, names, moments)
             wrapped = nn.parallel.DistributedDataParallel(model) if world > 1 else model
+            half = torch.autocast(place.type, torch.bfloat16, enabled=config.training.precision == "bfloat16")
+            called = torch.compile(wrapped) if config.training.compile else wrapped
             started, saved = time.monotonic() - position.elapsed, time.monotonic()
             while not _done(position, stage, budget):
                 batches = epoch_batches(
@@ -144,10 +145,10 @@ def train(
                     progress = _progress(position, stage, len(batches), budget)
                     rate = _learning_rate(optimizer, stage, config.training.schedule, progress)
                     frame, target = frame_to(frame, place), target_to(target, place)  # noqa: PLW2901
-                    estimate = wrapped(frame, stage.name)
-                    loss = objective(
-                        config.losses, stage.name, estimate, target, scale_intrinsics(frame.intrinsics, 2)
-                    )
+                    with half:
+                        estimate = called(frame, stage.name)
+                    estimate = Estimate(*(x.float() for x in estimate))
+                    loss = training_loss(model, config.losses, stage.name, estimate, target, frame)
                     optimizer.zero_grad(set_to_none=True)
                     loss.total.backward()  # type: ignore[no-untyped-call]
                     nn.utils.clip_grad_norm_(learning, 1.0)
@@ -178,7 +179,9 @@ def train(
         position.stage = len(config.stages)
         data.close()
         if rank == 0:
-            provenance = {**source, "steps": position.step, "losses": losses}
+            provenance: dict[str, Any] = {**source, "steps": position.step, "losses": losses}
+            if isinstance(model, JointModel) and config.losses.uncertainty == "laplace":
+                provenance["uncertainty"] = calibrate(model, dataset, place)
             save_model(out / "model.safetensors", model, config, provenance)
             save_resume(out / "resume.safetensors", model, optimizer, names, _state(position, key))
         log.close()
@@ -194,7 +197,7 @@ def _state(position: Position, key: str) -> dict[str, Any]:
     return {"key": key, **position.__dict__}
 
 
-def _resume(out: Path, model: JointModel, key: str) -> tuple[Position, dict[str, dict[str, Tensor]]]:
+def _resume(out: Path, model: Model, key: str) -> tuple[Position, dict[str, dict[str, Tensor]]]:
     """Load the resume point of a folder into the model, if there is one."""
     path = Path(out) / "resume.safetensors"
     if not path.exists():
@@ -254,7 +257,7 @@ def _learning_rate(optimizer: torch.optim.Adam, stage: Stage, schedule: str, pro
     return rate
 
 
-def _validate(model: JointModel, dataset: Path, place: torch.device) -> dict[str, float]:
+def _validate(model: Model, dataset: Path, place: torch.device) -> dict[str, float]:
     """MAE (m) and mean angle (deg) on the first frames of the ``val`` split; empty where there is no such split."""
     if not load_manifest(dataset).split("val"):
         return {}

@@ -137,11 +137,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _failed(
             str(err), "set TOFCAPTURE_TRACEBACK=1 to see where", 1, type(err).__name__, as_json=as_json
         )
-    if as_json:
-        print(json.dumps(outcome.data, allow_nan=False, default=str))
-    elif outcome.text:
-        print(outcome.text)
+    _tell(json.dumps(outcome.data, allow_nan=False, default=str) if as_json else outcome.text)
     return outcome.exit_code
+
+
+def _tell(text: str) -> None:
+    """Print a result; whoever closes the pipe early (``| head``) has read enough."""
+    if not text:
+        return
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # or the interpreter complains as it ends
 
 
 def _failed(message: str, hint: str, code: int, kind: str, *, as_json: bool) -> int:

@@ -1,4 +1,4 @@
-"""``tofcapture check``: list every problem of a view, a shard, a recording or a dataset."""
+"""``tofcapture check``: list every problem of a view, a shard, a recording, a dataset or a cache."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ _EVERY = 5.0  # s between lines of progress
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", type=Path, metavar="PATH", help="view file, shard, recording or dataset")
+    parser.add_argument(
+        "path", type=Path, metavar="PATH", help="view file, shard, recording, dataset or cache"
+    )
 
 
 def _run(args: argparse.Namespace) -> Outcome:
@@ -48,7 +50,7 @@ def _run(args: argparse.Namespace) -> Outcome:
 
 
 COMMAND = Command(
-    help="list every problem of a view, a shard, a recording or a dataset",
+    help="list every problem of a view, a shard, a recording, a dataset or a cache",
     example="tofcapture check datasets/first",
     configure=_configure,
     run=_run,

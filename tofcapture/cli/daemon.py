@@ -7,6 +7,7 @@ import os
 import sys
 from pathlib import Path
 
+from tofcapture.cli.config import station_path
 from tofcapture.command import Command, Outcome
 
 
@@ -42,7 +43,8 @@ def _run(args: argparse.Namespace) -> Outcome:
     from tofcapture.record.daemon.settings import Settings
 
     http = tcp_address(args.http) if args.http else None
-    station = args.station.resolve() if args.station else None
+    named = station_path(args.station)[0]
+    station = named.resolve() if named else None
     read_station(station)
     args.root.mkdir(parents=True, exist_ok=True)
     settings = Settings(args.root.resolve(), state, station, args.allow_motion)

@@ -17,6 +17,7 @@ from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from tofcapture.cli.config import station_path
 from tofcapture.cli.doctor_probe import Finding, probe
 from tofcapture.command import Command, Outcome
 from tofcapture.errors import ConfigError, TofError
@@ -218,7 +219,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> Outcome:
     folder = args.folder.absolute()
-    station = str(args.station) if args.station else ""
+    station = str(station_path(args.station)[0] or "")
     # A UR arm's handshake may take seconds at each of its stages.
     devices = [
         lambda: probe("station", station, "open" if args.open else "", timeout=180.0 if args.open else 90.0)

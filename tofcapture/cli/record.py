@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tofcapture.cli.config import station_path
 from tofcapture.command import Command, Outcome
 from tofcapture.errors import MotionRefused
 
@@ -79,6 +80,7 @@ def _run(args: argparse.Namespace) -> Outcome:
     from tofcapture.record.scene_plan import plan_scene
 
     scene = CALIBRATION if args.calibration else args.scene
+    args.station = station_path(args.station)[0]
     views = args.views if args.views is not None else _BOARD_VIEWS if args.calibration else _SCENE_VIEWS
     if (handed := _handed_over(args, scene, views)) is not None:
         return handed

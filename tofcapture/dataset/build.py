@@ -23,6 +23,7 @@ from tofcapture.dataset.truth import TruthError, pooled_error
 from tofcapture.errors import ConfigError, TofError
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
 from tofcapture.files.seal import PARTIAL
+from tofcapture.files.shard import ShardReader
 
 
 @dataclass(frozen=True)
@@ -174,7 +175,8 @@ def _result(
     *,
     whole: bool,
 ) -> BuildResult:
-    splits = assign_splits(t.scene for t in tasks)
+    there = {t.scene: t.path for t in tasks if outcomes.get(t.scene, SceneOutcome(None)).sha256}
+    splits = assign_splits((t.scene for t in tasks), {scene: _objects(path) for scene, path in there.items()})
     entries: dict[str, SceneEntry] = {}
     failures: dict[str, TofError] = {}
     for task in tasks:
@@ -192,6 +194,12 @@ def _result(
     skipped = tuple(scene for scene, o in sorted(outcomes.items()) if o.skipped)
     peak = max((o.peak_memory for o in outcomes.values()), default=0)
     return BuildResult(out, entries, skipped, failures, missing, gt, peak)
+
+
+def _objects(shard: Path) -> list[str]:
+    """Objects that a shard says it shows; none when it does not know."""
+    with ShardReader(shard) as reader:
+        return [str(name) for name in reader.provenance.get("objects") or ()]
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.layout import BOARD_SCENE
-from tofcapture.files.view import read_view
+from tofcapture.files.view import read_depth_view
 from tofcapture.rig import Rig, load_rig
 
 
@@ -56,7 +56,7 @@ def rig_for(recording: Path, first_view: Path, rig_path: Path | None, *, true_ri
         No rig there, or the true rig asked of a view that does not know it.
     """
     if true_rig:
-        view = read_view(first_view)
+        view, _ = read_depth_view(first_view)
         if view.truth is None:
             raise ConfigError(
                 f"{first_view}: carries no true rig", hint="--true-rig is for simulated recordings"

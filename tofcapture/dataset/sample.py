@@ -17,7 +17,7 @@ from tofcapture.files.info import tof_from, tof_table
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, TofMaps
 from tofcapture.frames import TofBurst, TofInfo, View
-from tofcapture.ops.crop import Crop, crop_depth, find_crop
+from tofcapture.ops.crop import Crop, crop_depth, find_crop, lowered
 from tofcapture.ops.denoise import denoise
 from tofcapture.ops.normals import GRAZING_COSINE, PlaneField
 from tofcapture.ops.phase import Decoder
@@ -38,7 +38,8 @@ class SampleConfig:
     Attributes
     ----------
     crop_radius
-        Largest distance of the object from the point the ToF camera looks at, along the table, metres.
+        Largest distance of the object from the point the ToF camera looks at, along the table, metres; from 100 m on
+        everything is the object: no table is looked for and no pixel is OUTSIDE.
     far
         Largest depth of ground truth in the ToF frame, metres.
     """
@@ -47,7 +48,13 @@ class SampleConfig:
     far: float = 2.0
 
 
-def make_sample(view: View, rig: Rig, config: SampleConfig, rng: np.random.Generator) -> Sample:
+def make_sample(
+    view: View,
+    rig: Rig,
+    config: SampleConfig,
+    rng: np.random.Generator,
+    depth: NDArray[np.float32] | None = None,
+) -> Sample:
     """Make one sample: the paper's pre-processing, section III.
 
     Parameters
@@ -60,6 +67,8 @@ def make_sample(view: View, rig: Rig, config: SampleConfig, rng: np.random.Gener
         Constants of the ground truth.
     rng
         Draws the triples of the plane search; the same state gives the same sample.
+    depth
+        (SH, SW) z of the view's point map, for a view that was read without it.
 
     Returns
     -------
@@ -73,7 +82,7 @@ def make_sample(view: View, rig: Rig, config: SampleConfig, rng: np.random.Gener
     check_cameras(view, rig)
     T_base_tof = view.arm_before.T_base_flange @ rig.T_flange_tof
     tof = decode_burst(view.tof, calibrated(view.tof.info, rig))
-    measured = np.ascontiguousarray(view.stereo.points[..., 2])
+    measured = np.ascontiguousarray(view.stereo.points[..., 2] if depth is None else depth)
     native = np.where(denoise(measured, rig.stereo), measured, np.float32(np.nan))
     sheet = triangulate(native, rig.stereo)
     field = PlaneField(np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
@@ -151,19 +160,20 @@ def smoothed(projection: Projection, field: PlaneField, rig: Rig, camera: Camera
     """
     from tofcapture.ops.kernels.pixels import refine
 
-    hit = np.isfinite(projection.depth)
-    planes, residuals = field.at(projection.pixels[hit])
-    depth, normals = projection.depth[hit], projection.normals[hit]
-    refine(planes, residuals, rig.T_tof_stereo, camera.rays[hit], WITHIN, depth, normals)
-    out = replace(projection, depth=projection.depth.copy(), normals=projection.normals.copy())
-    out.depth[hit], out.normals[hit] = depth, normals
-    return out
+    planes, residuals = field.at(projection.pixels.reshape(-1, 2))
+    depth, normals = projection.depth.copy(), projection.normals.copy()
+    rays = camera.rays.reshape(-1, 3)
+    refine(planes, residuals, rig.T_tof_stereo, rays, WITHIN, depth.reshape(-1), normals.reshape(-1, 3))
+    return replace(projection, depth=depth, normals=normals)
 
 
 def assemble(projection: Projection, rig: Rig, camera: Camera, crop: Crop) -> GroundTruth:
-    """Put every reason for mistrust into the bits of one mask."""
+    """Put every reason for mistrust into the bits of one mask; where nothing is cropped, nothing is OUTSIDE."""
     from tofcapture.ops.kernels.pixels import judge
 
+    some = projection.depth[::SPARSE, ::SPARSE, None] * camera.rays[::SPARSE, ::SPARSE]
+    crop = lowered(crop, some[~projection.edge[::SPARSE, ::SPARSE]])
+    outside = MaskBit.OUTSIDE if np.isfinite(crop.offset) else 0
     mask = np.zeros(camera.shape, dtype=np.uint8)
     for bit, where in (
         (MaskBit.NOT_HIT, np.isnan(projection.depth)),
@@ -180,7 +190,7 @@ def assemble(projection: Projection, rig: Rig, camera: Camera, crop: Crop) -> Gr
         np.append(crop.normal, crop.offset),
         crop.centre,
         np.array([crop.clearance, crop.radius, crop.far]),
-        (int(MaskBit.GRAZING), int(MaskBit.OUTSIDE)),
+        (int(MaskBit.GRAZING), int(outside)),
         mask,
     )
     return GroundTruth(projection.depth.astype(np.float32), projection.normals.astype(np.float32), mask)

@@ -12,6 +12,7 @@ import resource
 import shutil
 import socket
 import sys
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofcapture import __version__
 from tofcapture.dataset.crew import Crew, one_thread
@@ -32,7 +34,7 @@ from tofcapture.files.layout import SHARD
 from tofcapture.files.seal import digest_path, sealed_digest
 from tofcapture.files.shard import Sample, ShardReader
 from tofcapture.files.shard_writer import ShardWriter
-from tofcapture.files.view import read_view
+from tofcapture.files.view import read_depth_view
 from tofcapture.frames import View
 from tofcapture.rig import Rig, dumps_rig
 
@@ -103,7 +105,7 @@ class SceneOutcome:
 
 def versions() -> dict[str, str]:
     """Versions that a shard's bytes depend on."""
-    out = {"tofcapture": __version__}
+    out = {"tofcapture": __version__, "zlib": zlib.ZLIB_RUNTIME_VERSION}
     for name in ("numpy", "h5py", "numba"):
         try:
             out[name] = version(name)
@@ -120,18 +122,18 @@ def peak_memory() -> int:
 
 def sample_of(path: Path, rig: Rig, config: SampleConfig) -> Made:
     """Read a view and make its sample, with its error where the truth is known."""
-    return _made(read_view(path), rig, config)
+    return _made(*read_depth_view(path), rig, config)
 
 
-def _made(view: View, rig: Rig, config: SampleConfig) -> Made:
-    sample = make_sample(view, rig, config, np.random.default_rng(view.index))
+def _made(view: View, depth: NDArray[np.float32], rig: Rig, config: SampleConfig) -> Made:
+    sample = make_sample(view, rig, config, np.random.default_rng(view.index), depth)
     return sample, view_error(sample, view)
 
 
-def _samples(task: SceneTask, first: View, crew: Crew | None) -> Iterator[Made]:
+def _samples(task: SceneTask, first: tuple[View, NDArray[np.float32]], crew: Crew | None) -> Iterator[Made]:
     """Samples in the order of the views, made here or by a crew."""
     if crew is None:
-        yield _made(first, task.rig, task.config)
+        yield _made(*first, task.rig, task.config)
         yield from (sample_of(path, task.rig, task.config) for path in task.views[1:])
         return
     early: dict[int, Made] = {}
@@ -158,9 +160,12 @@ def _work_folder(path: Path) -> Iterator[Path]:
 
 
 def _provenance(
-    task: SceneTask, inputs: tuple[str, ...], good: list[int], gt: TruthError | None
+    task: SceneTask, inputs: tuple[str, ...], first: View, good: list[int], gt: TruthError | None
 ) -> dict[str, Any]:
+    # Simulated scenes know their objects; check looks for them in other splits.
+    objects = first.provenance.get("objects")
     return {
+        **({} if objects is None else {"objects": list(objects)}),
         "digest": task.digest(inputs),
         "config": asdict(task.config),
         "versions": versions(),
@@ -197,20 +202,20 @@ def build_shard(
     DataError
         A view is damaged or is of another camera than the rig; nothing is left behind.
     """
-    first = read_view(task.views[0])
+    first, depth = read_depth_view(task.views[0])
     info = calibrated(first.tof.info, task.rig)
     errors: list[ViewError] = []
     good: list[int] = []
     with _work_folder(task.path) as work:
         made = work / task.path.name
         with ShardWriter(made, task.scene, task.rig, info, first.stereo.info, len(task.views)) as shard:
-            for sample, error in _samples(task, first, crew):
-                shard.add(sample)
+            for path, (sample, error) in zip(task.views, _samples(task, (first, depth), crew), strict=True):
+                shard.add(sample, path)
                 good.append(int((sample.ground_truth[2].mask == 0).sum()))
                 errors += [] if error is None else [error]
                 if progress:
                     progress(len(good))
-            digest = shard.seal(_provenance(task, inputs, good, pool(errors) if errors else None))
+            digest = shard.seal(_provenance(task, inputs, first, good, pool(errors) if errors else None))
         digest_path(made).replace(digest_path(task.path))  # first: a shard always has its digest
         made.replace(task.path)
     return digest

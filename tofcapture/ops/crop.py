@@ -6,7 +6,7 @@ than the table does. The scene's object is what stands above the table, not far 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,11 @@ UPRIGHT = 0.985  # cos 10 deg; a table is at most this far from level
 SLANTED = 0.866  # cos 30 deg
 TALLEST = 0.4  # m; a parallel plane further below a flat top is the floor, not the table
 ABOVE = 3.0  # standard deviations of the table's points; one in 700 of them is higher
-LOWEST = 0.0008  # m; no table is flatter
+LOWEST = 0.0008  # m; single points are no surer of a table
+LOWEST_SMOOTH = 0.00025  # m; nor are depths of planes that were fitted to many
+WHOLE = 100.0  # m; a crop of this radius or more is no crop
+ABOVE_SMOOTH = 4.0  # standard deviations of smoothed points; a small far object has a hundred times fewer pixels than its table
+FEWEST = 500  # table points that tell its scatter
 PARALLEL = 0.05  # share of the points that makes a parallel plane below
 
 
@@ -173,24 +177,56 @@ def find_crop(
     rng
         For the plane search.
     radius
-        Largest distance of the object from the point the camera looks at, along the table, metres.
+        Largest distance of the object from the point the camera looks at, along the table, metres; from 100 m on the scene
+        is all that there is: no table is looked for.
     far
         Largest depth, metres.
 
     Returns
     -------
     Crop
-        Without a dominant plane it keeps everything within ``far``.
+        Without a dominant plane, or with a radius of 100 m or more, it keeps everything within ``far``.
     """
+    everything = Crop(np.full(3, np.nan), np.nan, np.zeros(3), np.inf, 0.0, far)
+    if radius >= WHOLE:
+        return everything
     cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     cloud = cloud[np.isfinite(cloud[:, 2]) & (cloud[:, 2] > 0) & (cloud[:, 2] < far)]
     found = table_plane(cloud, rng, up)
     if found is None:
-        return Crop(np.full(3, np.nan), np.nan, np.zeros(3), np.inf, 0.0, far)
+        return everything
     normal, offset, rms = found
     depth = offset / normal[2] if abs(normal[2]) > 0.1 else np.inf  # where the optical axis meets the table
     axis = np.array([0.0, 0.0, depth if 0 < depth < far else float(np.median(cloud[:, 2]))])
     return Crop(normal, offset, axis, radius, max(LOWEST, ABOVE * rms), far)
+
+
+def lowered(crop: Crop, points: NDArray[np.floating]) -> Crop:
+    """Lower a crop's clearance to what smoothed points allow: foreground begins where the table's own scatter ends.
+
+    Parameters
+    ----------
+    crop
+        From :func:`find_crop`, its clearance made for single measured points.
+    points
+        (..., 3) of the smoothed surface, ToF frame, metres; NaN: none.
+
+    Returns
+    -------
+    Crop
+        The same with a clearance of four standard deviations (1.48 MAD) of the points that the crop takes for table, never
+        more than before.
+    """
+    if not np.isfinite(crop.offset):
+        return crop
+    height = points @ crop.normal - crop.offset
+    height = height[np.abs(height) < crop.clearance]
+    if len(height) < FEWEST:
+        return crop
+    middle = np.median(height)
+    scatter = 1.4826 * float(np.median(np.abs(height - middle)))
+    clearance = max(LOWEST_SMOOTH, float(middle) + ABOVE_SMOOTH * scatter)
+    return replace(crop, clearance=min(crop.clearance, clearance))
 
 
 def inside(crop: Crop, points: NDArray[np.floating]) -> Bool:
@@ -224,7 +260,8 @@ def crop_depth(
 
     out = np.empty(depth.shape, np.float32)
     limits = np.array([crop.clearance, crop.radius, crop.far])
-    x, y = camera.rays[0, :, 0].copy(), camera.rays[:, 0, 1].copy()
+    rays = camera.pinhole("stereo depth").rays
+    x, y = rays[0, :, 0].copy(), rays[:, 0, 1].copy()
     plane = np.append(crop.normal, crop.offset)
     above(depth, x, y, plane, crop.centre, limits, T_tof_camera, out)
     return out

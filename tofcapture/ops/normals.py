@@ -20,6 +20,7 @@ Bool = NDArray[np.bool_]
 
 RADII = (2, 4, 8, 12)  # pixels, windows that PlaneField chooses from
 TOLERANCE = 2.0  # a window is flat while its residual is below this many times the median of such windows
+TYPICAL = 4000  # windows, at least, whose median is taken
 GRAZING_COSINE = 0.25882  # cos 75 deg
 _MIN_SPREAD = 1e-4  # det / trace^2 of the window's rays; below, they are a line and the plane may swivel
 
@@ -151,7 +152,7 @@ class PlaneField:
 
         if depth.shape != camera.shape:
             raise DataError(f"normals: expected depth of shape {camera.shape}, got {depth.shape}")
-        self._camera = camera
+        self._camera = camera.pinhole("plane field")
         self._sums = table(depth, camera.rays[0, :, 0].copy(), camera.rays[:, 0, 1].copy())
 
     def at(self, pixels: Float64, radii: Sequence[int] = RADII) -> tuple[Float64, Float64]:
@@ -160,7 +161,7 @@ class PlaneField:
         Parameters
         ----------
         pixels
-            (n, 2) as (u, v), inside the image.
+            (n, 2) as (u, v), inside the image; NaN gives NaN.
         radii
             Of the windows to choose from, ascending, pixels; windows are whole cells of 2 x 2 pixels.
 
@@ -172,17 +173,19 @@ class PlaneField:
         residual
             (n,) standard deviation of inverse depth about it, 1 / metres; NaN where no window is flat.
         """
-        from tofcapture.ops.kernels.planes import CELL, choose, fits
+        from tofcapture.ops.kernels.planes import CELL, choose, residuals
 
         pixels = np.ascontiguousarray(pixels, dtype=np.float64)
-        planes, residuals = np.empty((len(pixels), len(radii), 3)), np.empty((len(pixels), len(radii)))
         cells = np.array([max(1, r // CELL) for r in radii])
-        fits(self._sums, pixels, cells, _MIN_SPREAD, planes, residuals)
+        some = pixels[np.isfinite(pixels[:, 0])]
+        some = np.ascontiguousarray(some[:: max(1, len(some) // TYPICAL)])
+        found = np.empty((len(some), len(radii)))
+        residuals(self._sums, some, cells, _MIN_SPREAD, found)
+        limits = TOLERANCE * np.array([_typical(found[:, k]) for k in range(len(radii))])
         chosen, residual = np.empty((len(pixels), 3)), np.empty(len(pixels))
         eye = self._camera
         rays = (pixels - [eye.cx, eye.cy]) / [eye.fx, eye.fy]
-        limits = [_typical(residuals[:, k]) for k in range(len(radii))]
-        choose(planes, residuals, TOLERANCE * np.array(limits), cells, rays, chosen, residual)
+        choose(self._sums, pixels, cells, limits, _MIN_SPREAD, rays, chosen, residual)
         return chosen, residual
 
 

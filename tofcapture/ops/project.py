@@ -28,6 +28,7 @@ STEEPEST = 5.67  # tan 80 deg: neighbours further apart in depth are not one sur
 FILLED_GAP = 4  # pixels; a hole that is not wider, in a smooth surface, is interpolated
 NEARER = 0.95  # things are at most this much nearer than the nearest that is measured
 STEPS = 6  # places along a ray that must lie in the common view
+LENS_FINER = 2  # times as fine a pinhole image is what a lens is looked up in
 HIDES = 0.002  # m, and relative; a skirt hides the sheet when it is nearer by both
 
 
@@ -75,7 +76,8 @@ class Projection:
 
 def _axes(camera: Camera) -> tuple[Float64, Float64]:
     """Rays of a camera's columns and rows."""
-    return camera.rays[0, :, 0].copy(), camera.rays[:, 0, 1].copy()
+    rays = camera.pinhole("stereo depth").rays
+    return rays[0, :, 0].copy(), rays[:, 0, 1].copy()
 
 
 def triangulate(depth: NDArray[np.floating], camera: Camera) -> Sheet:
@@ -125,6 +127,35 @@ def _jumps(depth: Float64, camera: Camera) -> Bool:
     return out
 
 
+def _through_lens(
+    sheet: Sheet, stereo: Camera, T_tof_stereo: Float64, camera: Camera, edge_pixels: int, far: float
+) -> Projection:
+    """Render into a finer pinhole camera; every ray of the lens meets the triangle that its nearest fine ray met."""
+    rays = camera.rays
+    low, high = rays[..., :2].min(axis=(0, 1)), rays[..., :2].max(axis=(0, 1))
+    focal = LENS_FINER * np.array([camera.fx, camera.fy])
+    size = np.ceil((high - low) * focal).astype(int) + 3
+    centre = 1 - low * focal
+    fine = Camera(int(size[0]), int(size[1]), *focal.tolist(), *centre.tolist())
+    found = project(sheet, stereo, T_tof_stereo, fine, 0, far)
+    u, v = np.rint(fine.project(rays)[0]).astype(np.intp).transpose(2, 0, 1)
+    depth, normals, at = found.depth[v, u], found.normals[v, u], fine.rays[v, u]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slid = depth * (normals * at).sum(axis=-1) / (normals * rays).sum(axis=-1)
+        # Where a triangle is seen from its side, half a fine pixel is far along it: its own depth is nearer to the truth.
+        slid = np.where(np.abs(slid - depth) < STEEPEST / focal.min() * depth, slid, depth)
+    back = invert(T_tof_stereo)
+    points = (slid[..., None] * rays) @ back[:3, :3].T + back[:3, 3]
+    near_edge = found.edge[v, u] | np.isnan(slid) | _jumps(slid, camera)
+    return Projection(
+        depth=slid,
+        pixels=stereo.project(points)[0],
+        normals=normals,
+        occluded=found.occluded[v, u],
+        edge=_dilate(near_edge, edge_pixels),
+    )
+
+
 def project(
     sheet: Sheet, stereo: Camera, T_tof_stereo: Float64, camera: Camera, edge_pixels: int, far: float = np.inf
 ) -> Projection:
@@ -145,6 +176,8 @@ def project(
     far
         Points deeper than this in the ToF frame are no surface, metres.
     """
+    if camera.distortion:
+        return _through_lens(sheet, stereo, T_tof_stereo, camera, edge_pixels, far)
     from tofcapture.ops.kernels.sheet import borders, render, unseen
 
     eye = np.array([camera.fx, camera.fy, camera.cx, camera.cy])

@@ -191,7 +191,7 @@ def _finish(out: Path, scenes: Sequence[Made]) -> tuple[dict[str, str], dict[str
     from tofcapture.dataset.truth import pooled_error
     from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
 
-    splits = assign_splits([m.scene for m in scenes])
+    splits = assign_splits([m.scene for m in scenes], {m.scene: m.objects for m in scenes})
     entries = {
         m.scene: SceneEntry(f"shards/{m.scene}.h5", m.sha256, m.views, splits[m.scene])
         for m in sorted(scenes, key=lambda m: m.scene)

@@ -20,7 +20,7 @@ from tofcapture.poses import Float64
 from tofcapture_model.baselines import sensor
 from tofcapture_model.data import batched, make_frame
 from tofcapture_model.frame import Frame
-from tofcapture_model.joint import JointModel
+from tofcapture_model.zoo import Model
 
 Float32 = NDArray[np.float32]
 FRAME = 0  # of the burst; evaluate takes the same one
@@ -130,7 +130,7 @@ def choose(manifest: Manifest, split: str, count: int) -> list[tuple[str, int]]:
 
 
 def load_examples(
-    dataset: Path, manifest: Manifest, chosen: list[tuple[str, int]], model: JointModel | None
+    dataset: Path, manifest: Manifest, chosen: list[tuple[str, int]], model: Model | None
 ) -> list[Example]:
     """Read views and let the sensor and the model answer.
 
@@ -142,7 +142,9 @@ def load_examples(
     out = []
     with _one_thread():
         for scene, view in chosen:
-            with ShardReader(Path(dataset) / manifest.scenes[scene].path) as shard:
+            with ShardReader(
+                Path(dataset) / manifest.scenes[scene].path, manifest.scenes[scene].sha256
+            ) as shard:
                 out.append(_example(shard, view, model))
     return out
 
@@ -159,7 +161,7 @@ def _one_thread() -> Iterator[None]:
 
 
 @torch.inference_mode()
-def _example(shard: ShardReader, view: int, model: JointModel | None) -> Example:
+def _example(shard: ShardReader, view: int, model: Model | None) -> Example:
     info, camera = shard.info, shard.camera
     frame = batched(make_frame(shard.raw(view, FRAME), info, camera, shard.celsius(view, FRAME)))
     depth, normals, _ = sensor.estimate(frame)
@@ -178,7 +180,7 @@ def _example(shard: ShardReader, view: int, model: JointModel | None) -> Example
     )
 
 
-def _ask(model: JointModel, frame: Frame) -> Answer:
+def _ask(model: Model, frame: Frame) -> Answer:
     estimate = model(frame)
     return Answer(_map(estimate.depth), _vectors(estimate.normals), _map(estimate.error))
 
@@ -193,7 +195,7 @@ def _vectors(tensor: torch.Tensor) -> Float32:
 
 def describe_shard(dataset: Path, manifest: Manifest, scene: str) -> Mapping[str, Any]:
     """Rig, cameras and error of the ground truth of one shard, for the page."""
-    with ShardReader(Path(dataset) / manifest.scenes[scene].path) as shard:
+    with ShardReader(Path(dataset) / manifest.scenes[scene].path, manifest.scenes[scene].sha256) as shard:
         return {
             "scene": scene,
             "rig": shard.rig,

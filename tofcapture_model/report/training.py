@@ -13,7 +13,7 @@ from tofcapture.errors import ConfigError
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.config import Config, dumps_config
-from tofcapture_model.joint import JointModel
+from tofcapture_model.zoo import Model
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM = 640, 220, 56, 34
 _MOST = 400  # points of a curve
@@ -35,7 +35,7 @@ class Network:
         Lines of ``metrics.jsonl``; empty where there is none.
     """
 
-    model: JointModel
+    model: Model
     config: Config
     provenance: Mapping[str, Any]
     name: str

@@ -65,54 +65,58 @@ def fit(sums: Float64, min_spread: float, plane: Float64) -> float:
 
 
 @compiled
-def fits(
-    sums: Float64,
-    pixels: Float64,
-    radii: NDArray[np.int64],
-    min_spread: float,
-    planes: Float64,
-    residuals: Float64,
+def fit_window(
+    sums: Float64, u: int, v: int, r: int, min_spread: float, window: Float64, plane: Float64
+) -> float:
+    """Fit a plane in the window of radius ``r`` about cell (u, v); as :func:`fit`, ``window`` (10,) is for its use."""
+    left, right = max(u - r, 0), min(u + r + 1, sums.shape[1] - 1)
+    top, bottom = max(v - r, 0), min(v + r + 1, sums.shape[0] - 1)
+    for k in range(10):
+        window[k] = (sums[bottom, right, k] - sums[top, right, k]) - (
+            sums[bottom, left, k] - sums[top, left, k]
+        )
+    return fit(window, min_spread, plane)
+
+
+@compiled
+def residuals(
+    sums: Float64, pixels: Float64, radii: NDArray[np.int64], min_spread: float, out: Float64
 ) -> None:
-    """Fit a plane in windows of every radius (in cells) about every pixel (n, 2): (n, r, 3) planes, (n, r) residuals."""
-    rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
-    window = np.empty(10)
+    """Residuals (n, r) of the planes in windows of every radius (in cells) about pixels (n, 2)."""
+    window, plane = np.empty(10), np.empty(3)
     for i in range(len(pixels)):
         u, v = int(np.rint(pixels[i, 0])) // CELL, int(np.rint(pixels[i, 1])) // CELL
         for j in range(len(radii)):
-            r = radii[j]
-            left, right = max(u - r, 0), min(u + r + 1, columns)
-            top, bottom = max(v - r, 0), min(v + r + 1, rows)
-            for k in range(10):
-                window[k] = (sums[bottom, right, k] - sums[top, right, k]) - (
-                    sums[bottom, left, k] - sums[top, left, k]
-                )
-            residuals[i, j] = fit(window, min_spread, planes[i, j])
+            out[i, j] = fit_window(sums, u, v, radii[j], min_spread, window, plane)
 
 
 @compiled
 def choose(
-    planes: Float64, residuals: Float64, limits: Float64, radii: NDArray[np.int64], rays: Float64,
+    sums: Float64, pixels: Float64, radii: NDArray[np.int64], limits: Float64, min_spread: float, rays: Float64,
     chosen: Float64, residual: Float64,
 ) -> None:  # fmt: skip
-    """Of every pixel's planes take the largest window's whose residual is within the limits, else the smallest window's.
+    """Of every pixel's windows take the largest one's plane whose residual is within the limits, else the smallest one's.
 
     A plane through a bent surface misses its middle by an amount that grows with the square of the window; two windows tell
     it, and the plane is moved to where it vanishes. ``rays`` (n, 2) are x and y at the pixels. ``residual`` (n,) is that of
-    a plane within the limits, NaN otherwise.
+    a plane within the limits, NaN otherwise. Pixels (n, 2) of NaN get NaN.
     """
-    for i in range(len(planes)):
-        chosen[i, :], residual[i], best = np.nan, np.nan, -1
-        for j in range(planes.shape[1]):
-            flat = residuals[i, j] <= limits[j]
-            if flat or (best < 0 and np.isfinite(residuals[i, j])):
-                best = j
-                residual[i] = residuals[i, j] if flat else np.nan
-        if best < 0:
+    window, large, small = np.empty(10), np.empty(3), np.empty(3)
+    for i in range(len(pixels)):
+        chosen[i, :], residual[i] = np.nan, np.nan
+        if not np.isfinite(pixels[i, 0]):
             continue
-        chosen[i, :] = planes[i, best]
-        if best > 0 and np.isfinite(residuals[i, best - 1]) and np.isfinite(residual[i]):
-            large, small = planes[i, best], planes[i, best - 1]
-            there = large[0] * rays[i, 0] + large[1] * rays[i, 1] + large[2]
-            inner = small[0] * rays[i, 0] + small[1] * rays[i, 1] + small[2]
-            share = ((2 * radii[best - 1] + 1) / (2 * radii[best] + 1)) ** 2
-            chosen[i, :] *= (inner - share * there) / (1 - share) / there
+        u, v = int(np.rint(pixels[i, 0])) // CELL, int(np.rint(pixels[i, 1])) // CELL
+        for j in range(len(radii) - 1, -1, -1):
+            left = fit_window(sums, u, v, radii[j], min_spread, window, large)
+            if np.isfinite(left):  # the smallest such window stays where none is flat
+                chosen[i, :] = large
+            if not left <= limits[j]:
+                continue
+            residual[i] = left
+            if j > 0 and np.isfinite(fit_window(sums, u, v, radii[j - 1], min_spread, window, small)):
+                there = large[0] * rays[i, 0] + large[1] * rays[i, 1] + large[2]
+                inner = small[0] * rays[i, 0] + small[1] * rays[i, 1] + small[2]
+                share = ((2 * radii[j - 1] + 1) / (2 * radii[j] + 1)) ** 2
+                chosen[i, :] *= (inner - share * there) / (1 - share) / there
+            break

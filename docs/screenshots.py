@@ -1,0 +1,70 @@
+"""Make the pictures of these pages anew: ``python docs/screenshots.py demo-out``, after ``make demo`` and ``make docs``.
+
+Needs playwright and Debian's chromium. The daemon's page is photographed by its own test (``TOFCAPTURE_SCREENSHOTS=1 pytest -m slow
+tests/test_daemon_browser.py``).
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+PICTURES = Path(__file__).parent / "pictures"
+SITE = Path(__file__).parent.parent / "build" / "docs" / "index.html"
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+RERUN_SECONDS = 30  # until a software renderer has drawn the space
+
+
+def sheets(demo: Path) -> None:
+    """Draw the contact sheets."""
+    for what, name in (
+        ("dataset", "view-sheet"),
+        ("recording", "view-recording"),
+        ("recording/rig.toml", "view-calibration"),
+    ):
+        words = [
+            sys.executable,
+            "-m",
+            "tofcapture",
+            "view",
+            demo / what,
+            "--png",
+            PICTURES / f"{name}.png",
+            "--views",
+            "5",
+        ]
+        subprocess.run(words, check=True)
+
+
+def pages(demo: Path) -> None:
+    """Photograph Rerun, the report and the site's home."""
+    from playwright.sync_api import sync_playwright
+
+    from tofcapture.viewer.web import make_server
+
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
+        rrd = Path(folder) / "view.rrd"
+        words = [sys.executable, "-m", "tofcapture", "view", demo / "dataset", "--save", rrd, "--views", "8"]
+        subprocess.run(words, check=True)
+        browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        page = browser.new_page(viewport={"width": 1200, "height": 800})
+        with make_server(rrd, 0) as server:
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            page.goto(f"http://127.0.0.1:{server.server_port}")
+            page.wait_for_timeout(1000 * RERUN_SECONDS)
+            page.screenshot(path=PICTURES / "view-rerun.png")
+            server.shutdown()
+        for path, name in ((demo / "report.html", "report"), (SITE, "docs-home")):
+            page.goto(path.resolve().as_uri())
+            page.wait_for_timeout(1000)
+            page.screenshot(path=PICTURES / f"{name}.png")
+        browser.close()
+
+
+if __name__ == "__main__":
+    sheets(Path(sys.argv[1]))
+    pages(Path(sys.argv[1]))

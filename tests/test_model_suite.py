@@ -1,0 +1,249 @@
+"""Suites of tables, calibration of the uncertainty, export and its backend, on small analytic scenes."""
+
+# ruff: noqa: E402  torch is optional
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from tests.test_model_baselines import target
+from tests.test_model_networks import frame
+from tests.test_model_training import make_dataset
+from tofcapture.cli import main
+from tofcapture.errors import ConfigError
+from tofcapture_model.checkpoint import load_model
+from tofcapture_model.config import Losses, Stage, preset
+from tofcapture_model.losses import error_map_loss, laplace_loss, reweighting
+from tofcapture_model.measures import Precision, Uncertainty, regions
+from tofcapture_model.predict import predict
+from tofcapture_model.suite import averaged, read_weights
+from tofcapture_model.tables import SUITES
+from tofcapture_model.train import train
+from tofcapture_model.zoo import build_model, training_loss
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """A training scene, a validation scene and a test scene at a quarter of the sensor's resolution."""
+    folder = tmp_path_factory.mktemp("data") / "dataset"
+    return make_dataset(folder, scale=2, views=2, splits=("train", "val", "test"))
+
+
+def tiny(name, seed=0):
+    """A preset that trains in no time."""
+    base = preset(name)
+    network = replace(base.network, width=4, levels=2)
+    training = replace(base.training, batch=2, crop=(48, 64), frames=1, validate_every=0, seed=seed)
+    return replace(base, network=network, training=training, stages=(Stage(base.stages[0].name, 1, 1e-3),))
+
+
+@pytest.fixture(scope="module")
+def runs(dataset, tmp_path_factory):
+    """Two runs of demo and one of coarse-fine."""
+    out = tmp_path_factory.mktemp("runs")
+    for name, seed in (("demo", 0), ("demo", 1), ("coarse-fine", 0)):
+        train(tiny(name, seed), dataset, out / f"{name}-{seed}")
+    return out
+
+
+def test_a_suite_writes_its_tables_and_every_number(dataset, runs, tmp_path, capsys):
+    """All suites in one command: methods without parameters, two runs averaged with their spread, three kinds of tables."""
+    weights = [
+        f"compact={runs / 'demo-0'}",
+        f"compact={runs / 'demo-1'}",
+        f"coarse-fine={runs / 'coarse-fine-0'}",
+    ]
+    command = [
+        "evaluate",
+        str(dataset),
+        "--suite",
+        "all",
+        "--weights",
+        *weights,
+        "--out",
+        str(tmp_path / "r.json"),
+    ]
+    assert main([*command, "--json"]) == 0
+    results = json.loads((tmp_path / "r.json").read_text())
+    assert list(results["methods"]) == ["sensor", "lf2", "compact", "coarse-fine"]
+    assert list(results["spread"]) == ["compact"]
+    compact = results["methods"]["compact"]
+    assert 0 <= compact["extra"]["coverage_1sigma"] <= 1
+    assert compact["extra"]["precision"] > 0
+    assert "coverage_1sigma" not in results["methods"]["sensor"]["extra"]
+    parts = [compact["regions"][r]["depth"]["pixel"]["pixels"] for r in ("edge", "interior")]
+    assert sum(parts) == compact["depth"]["pixel"]["pixels"]
+    text = (tmp_path / "tables.md").read_text()
+    assert all(suite.title in text for suite in SUITES.values())
+    assert "±" in text
+    assert r"\begin{tabular}" in (tmp_path / "tables.tex").read_text()
+    assert "<table>" in (tmp_path / "tables.html").read_text()
+    assert json.loads(capsys.readouterr().out)["suite"] == "all"
+
+
+def test_wrong_weights_and_scenes_are_named(dataset, runs):
+    """A pair without a name, a reserved name, a scene that is not there."""
+    for pair in ("nothing", "=x", "sensor=x"):
+        with pytest.raises(ConfigError, match="NAME=PATH"):
+            read_weights([pair])
+    assert main(["evaluate", str(dataset), "--suite", "main", "--scenes", "kitchen"]) == 3
+    assert main(["evaluate", str(dataset), "--weights", "a=b"]) == 3
+
+
+def test_runs_are_averaged_number_by_number():
+    """Mean and standard deviation; what one run lacks is left out."""
+    mean, spread = averaged([{"a": {"b": 1.0}, "c": 1}, {"a": {"b": 3.0}}])
+    assert mean == {"a": {"b": 2.0}}
+    assert spread["a"]["b"] == pytest.approx(2**0.5)
+
+
+def test_a_perfect_uncertainty_has_no_area_and_a_reversed_one_has_much():
+    """AUSE is zero for the right order; a sigma above every error covers all."""
+    error = torch.rand(1000, generator=torch.Generator().manual_seed(0))
+    good, bad = Uncertainty(), Uncertainty()
+    good.add(error, error)
+    bad.add(error, -error)
+    assert good.row() == {"coverage_1sigma": 1.0, "ause": 0.0}
+    assert bad.row(scale=False)["ause"] > 0.5
+    assert Uncertainty().row() == {}
+
+
+def test_precision_is_the_spread_of_a_pixel_over_the_shots():
+    """A constant offset between pixels is none; one frame has none."""
+    shots = Precision()
+    for k in range(10):
+        shots.add(torch.tensor([1.0, 2.0]) + 0.001 * (-1) ** k)
+    shots.close()
+    assert shots.row()["precision"] == pytest.approx(0.001 * (10 / 9) ** 0.5, rel=1e-3)
+    shots.add(torch.ones(2))
+    shots.close()
+    assert shots.views == 1
+
+
+def test_regions_split_the_good_pixels():
+    """Each pair of regions covers the good pixels once; a step of 10 cm is an edge."""
+    data = frame(batch=1)
+    truth = target(data)._replace(depth=torch.where(torch.arange(88) < 40, 0.8, 0.9).expand(1, 1, 72, 88))
+    found = regions(data, truth)
+    for a, b in (("edge", "interior"), ("mpi", "no-mpi"), ("dark", "bright")):
+        assert torch.equal(found[a] | found[b], truth.good)
+        assert not (found[a] & found[b]).any()
+    assert not found["edge"][..., :30].any()
+    assert torch.equal(found["edge"][..., 38:42], truth.good[..., 38:42])
+
+
+def test_the_uncertainty_is_calibrated_on_the_validation_split(dataset, runs):
+    """68 % of the errors of the first validation frames lie within the predicted sigma, and the checkpoint says so."""
+    from tofcapture_model.data import FrameDataset, batched
+
+    model, _, provenance = load_model(runs / "demo-0")
+    assert provenance["uncertainty"]["views"] == 2
+    assert float(model.error_map.calibration) == pytest.approx(provenance["uncertainty"]["factor"])
+    data, inside, total = FrameDataset(dataset, "val", frames=1), 0, 0
+    for sample in data.samples:
+        truth = data.target(sample)
+        with torch.no_grad():
+            found = model(batched(data.frame(sample)))
+        error = (found.depth[0] - truth.depth).abs()[truth.good]
+        inside, total = inside + int((error <= found.error[0][truth.good]).sum()), total + len(error)
+    assert inside / total == pytest.approx(0.6827, abs=0.02)
+
+
+def test_the_likelihood_is_best_at_the_mean_error():
+    """Of all constant scales the mean absolute error has the least loss; the depth gets no gradient."""
+    g = torch.Generator().manual_seed(0)
+    gt = torch.ones(1, 1, 20, 20)
+    depth = (gt + 0.01 * torch.randn(gt.shape, generator=g)).requires_grad_()
+    mask, mean = torch.ones_like(gt, dtype=torch.bool), (depth - gt).abs().mean().detach()
+    losses = [
+        laplace_loss(torch.full_like(gt, float(mean) * f), depth, gt, mask).item() for f in (0.8, 1.0, 1.25)
+    ]
+    assert losses[1] == min(losses)
+    scale = torch.full_like(gt, 0.01, requires_grad=True)
+    laplace_loss(scale, depth, gt, mask).backward()
+    assert depth.grad is None
+    assert scale.grad is not None
+
+
+def test_gradients_flow_where_the_paper_says_and_nowhere_else():
+    """Eq. 1 does not reach the error map through lambda, nor the error map's loss the depth network."""
+    network = replace(preset("paper").network, width=2, levels=2, refine_iterations=0)
+    model = build_model(replace(preset("paper"), network=network, stages=(Stage("depth", 1),)))
+    torch.nn.init.normal_(model.error_map.net.last.weight, std=0.01)
+    data = frame()
+    truth = target(data)
+    for part, reached, spared in (("depth", "raw2depth", "error_map"), ("error", "error_map", "raw2depth")):
+        model.zero_grad(set_to_none=True)
+        found = training_loss(model, Losses(chamfer=0.0), "depth", model(data, "depth"), truth, data)
+        found.parts[part].backward()
+        norms = {
+            name: sum(
+                float(p.grad.abs().sum()) for p in getattr(model, name).parameters() if p.grad is not None
+            )
+            for name in (reached, spared)
+        }
+        assert norms[reached] > 0
+        assert norms[spared] == 0
+    error = torch.full_like(truth.depth, 0.01, requires_grad=True)
+    assert not reweighting(truth.depth, error, truth.good).requires_grad
+    depth = truth.depth.clone().requires_grad_()
+    error_map_loss(error, depth, truth.depth, truth.good).backward()
+    assert depth.grad is None
+
+
+def test_bfloat16_trains_and_keeps_geometry_in_float32(dataset, tmp_path):
+    """Half precision is for convolutions; the answer stays float32 and finite."""
+    config = tiny("demo")
+    done = train(
+        replace(config, training=replace(config.training, precision="bfloat16")), dataset, tmp_path / "run"
+    )
+    assert np.isfinite(done.losses["total"])
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("kind", ["onnx", "torch"])
+def test_an_export_answers_as_torch_does(dataset, runs, tmp_path, kind):
+    """The export is checked on two batch sizes, and predict's onnx backend gives the same depth."""
+    if kind == "onnx":
+        pytest.importorskip("onnx")
+        pytest.importorskip("onnxruntime")
+    from tofcapture_model.export import export
+
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for file in (runs / "demo-0").glob("model.*"):
+        (folder / file.name).write_bytes(file.read_bytes())
+    out = folder / ("model.onnx" if kind == "onnx" else "model.pt2")
+    result = export(folder, out, kind=kind, size=(90, 120))
+    assert result["bytes"] == out.stat().st_size > 0
+    if kind == "onnx":
+        shard = dataset / "shards" / "scene-2.h5"
+        for backend in ("torch", "onnx"):
+            predict(shard, tmp_path / backend, weights=folder, backend=backend)
+        a, b = (np.load(tmp_path / k / "depth.npy") for k in ("torch", "onnx"))
+        assert np.quantile(np.abs(a - b), 0.99) < 1e-4
+
+
+def test_a_backend_without_its_file_says_what_to_do(dataset, runs, tmp_path):
+    """The onnx backend wants an export beside the weights."""
+    with pytest.raises(ConfigError, match="no such file"):
+        predict(dataset / "shards" / "scene-2.h5", tmp_path, weights=runs / "demo-0", backend="onnx")
+
+
+@pytest.mark.slow
+def test_all_tables_by_one_script(dataset, tmp_path):
+    """benchmarks/tables.py trains everything with tiny budgets and writes three suites."""
+    script = Path(__file__).parents[1] / "benchmarks" / "tables.py"
+    command = [sys.executable, str(script), str(dataset), "--out", str(tmp_path), "--minutes", "0.001"]
+    subprocess.run([*command, "--width", "2", "--crop", "48", "--frames", "1"], check=True, timeout=280)
+    for suite in ("main", "ablation", "inputs"):
+        assert (tmp_path / suite / "tables.md").exists()
+        assert json.loads((tmp_path / suite / "results.json").read_text())["suite"] == suite

@@ -1,0 +1,266 @@
+"""The viewer: every kind of file becomes shots, sheets and Rerun files; nothing that cannot be shown is a traceback."""
+
+import http.client
+import json
+import shutil
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.test_files_shard import RIG, write
+from tofcapture.cli import main
+from tofcapture.files.layout import MaskBit
+from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
+from tofcapture.rig import dumps_rig
+from tofcapture.viewer import open_source
+from tofcapture.viewer.colours import GOOD, GREY, MASK, limits, paint
+from tofcapture.viewer.shots import Panel, Shot, Source
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Two small shards and their manifest."""
+    folder = tmp_path / "data"
+    (folder / "shards").mkdir(parents=True)
+    entries = {}
+    for scene in ("mug", "box"):
+        digest = write(folder / "shards" / f"{scene}.h5", scene=scene)
+        entries[scene] = SceneEntry(f"shards/{scene}.h5", digest, 2, "train")
+    write_manifest(folder, Manifest(entries))
+    return folder
+
+
+@pytest.fixture
+def calibration(tmp_path):
+    """A rig and the evidence of its alignment."""
+    (tmp_path / "rig.toml").write_text(dumps_rig(RIG))
+    pairs = [
+        {"view": f"views/calibration/view-{i:03d}.h5", "accepted": i != 1, "rmse_mm": 1.0 + i}
+        for i in range(3)
+    ]
+    evidence = {
+        "format": "tofcapture-evidence",
+        "version": 1,
+        "backend": "open3d",
+        "views": 3,
+        "used": 2,
+        "pairs": pairs,
+    }
+    (tmp_path / "evidence.json").write_text(json.dumps(evidence))
+    return tmp_path
+
+
+@pytest.fixture
+def prediction(tmp_path):
+    """What predict writes."""
+    folder = tmp_path / "prediction"
+    folder.mkdir()
+    depth = np.full((4, 6), 0.8, np.float32)
+    np.save(folder / "depth.npy", depth)
+    np.save(folder / "error.npy", 0.01 * depth)
+    np.save(folder / "normals.npy", np.broadcast_to(np.float32([0, 0, -1]), (4, 6, 3)))
+    rows = np.zeros((24, 7), "<f4")
+    rows[:, 2] = 0.8
+    names = "".join(f"property float {n}\n" for n in ("x", "y", "z", "nx", "ny", "nz", "expected_error"))
+    (folder / "cloud.ply").write_bytes(
+        f"ply\nelement vertex 24\n{names}end_header\n".encode() + rows.tobytes()
+    )
+    return folder
+
+
+def test_kinds_are_told_apart(dataset, calibration, prediction):
+    """Datasets, shards, predictions and calibrations are recognised by what they hold."""
+    assert len(open_source(dataset).names) == 2 * len(open_source(dataset / "shards" / "mug.h5").names)
+    assert open_source(prediction).load(0).clouds["estimate"].points.shape == (24, 3)
+    for name in ("rig.toml", "evidence.json"):
+        said = open_source(calibration / name).calibration
+        assert [p[2] for p in said.pairs] == [True, False, True]
+        assert said.pairs[0][1] == pytest.approx(1e-3)
+
+
+def test_shots_of_a_shard_are_its_arrays(dataset):
+    """Error is sensor minus ground truth exactly where ground truth is good; clouds hold what is finite."""
+    shot = open_source(dataset / "shards" / "mug.h5").load(0)
+    by = {p.title: p for p in shot.panels}
+    error = by["ToF - ground truth"].values
+    assert np.isfinite(error).sum() > 0
+    assert shot.T_base_tof.shape == (4, 4)
+    assert len(shot.clouds["tof"].points) == np.isfinite(by["ToF depth"].values).sum()
+
+
+def test_colours_say_what_they_mean():
+    """No value is grey, zero error is white, the gravest mask bit wins, signed scales are symmetric."""
+    error = Panel("e", "error", np.array([[0.0, 0.01], [-0.002, np.nan]]))
+    low, high = limits([error])
+    assert low == -high
+    image = paint(error, low, high).image
+    assert tuple(image[1, 1]) == GREY
+    assert image[0, 0].min() > 240
+    assert paint(error, low, high).unit == "mm"
+    mask = Panel("m", "mask", np.array([[0, MaskBit.EDGE | MaskBit.NOT_HIT]], np.uint8))
+    assert tuple(paint(mask, 0, 1).image[0, 0]) == GOOD
+    assert tuple(paint(mask, 0, 1).image[0, 1]) == MASK[MaskBit.NOT_HIT]
+
+
+def test_views_are_thinned_evenly():
+    """First and last are kept, and never more than wanted."""
+    source = Source("t", [str(i) for i in range(100)], lambda i: Shot(str(i), []))
+    assert source.spread(5) == [0, 25, 50, 74, 99]
+    assert source.spread(200) == list(range(100))
+
+
+def test_contact_sheets_are_1200_wide(dataset, calibration, prediction, tmp_path, capsys):
+    """All kinds become PNG of 1200 pixels; the same input gives the same bytes."""
+    pytest.importorskip("matplotlib")
+    for path in (dataset, calibration / "rig.toml", prediction):
+        sheets = [tmp_path / f"{i}.png" for i in (1, 2)]
+        for sheet in sheets:
+            assert main(["view", str(path), "--png", str(sheet), "--views", "3"]) == 0
+        data = sheets[0].read_bytes()
+        assert int.from_bytes(data[16:20]) == 1200
+        assert data == sheets[1].read_bytes()
+    assert "3 of 4 views" in capsys.readouterr().out
+
+
+def test_rerun_files_are_written(dataset, calibration, tmp_path):
+    """A Rerun file of each kind; its own checker accepts it."""
+    pytest.importorskip("rerun")
+    for path in (dataset, calibration / "evidence.json"):
+        out = tmp_path / "x.rrd"
+        assert main(["view", str(path), "--save", str(out)]) == 0
+        assert out.read_bytes()[:4] == b"RRF2"
+
+
+@pytest.mark.parametrize(
+    ("make", "code"),
+    [
+        (lambda p: p / "nothing", 5),
+        (lambda p: _text(p / "notes.txt", "hello"), 5),
+        (lambda p: _text(p / "evidence.json", "{}"), 5),
+        (lambda p: _text(p / "rig.toml", "units = 'mm'"), 3),
+        (lambda p: _text(p / "half.h5", "\x89HDF\r\n\x1a\nxxxx", "latin-1"), 5),
+        (lambda p: p, 5),
+    ],
+)
+def test_what_cannot_be_shown_is_said(make, code, tmp_path, capsys):
+    """A sentence and a hint, the right exit code, and nothing written."""
+    assert main(["view", str(make(tmp_path)), "--png", str(tmp_path / "out.png")]) == code
+    said = capsys.readouterr().err
+    assert said.startswith("tofcapture: ")
+    assert "try: " in said or "expected" in said
+    assert len(said.splitlines()) <= 5
+    assert not (tmp_path / "out.png").exists()
+
+
+def _text(path, text, encoding="utf-8"):
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+@pytest.fixture
+def server(dataset, tmp_path):
+    """The page on a free port."""
+    pytest.importorskip("rerun")
+    from tofcapture.viewer.web import make_server
+
+    rrd = tmp_path / "x.rrd"
+    assert main(["view", str(dataset), "--save", str(rrd)]) == 0
+    with make_server(rrd, 0) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.slow
+def test_page_is_for_this_machine_only(server):
+    """It listens on the loopback interface, refuses other names, and its policy lets the browser ask nobody else."""
+    assert server.server_address[0] == "127.0.0.1"
+    link = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    for host, path, status in (
+        ("127.0.0.1", "/", 303),
+        ("localhost", "/view.rrd", 200),
+        ("127.0.0.1", "/etc/passwd", 404),
+        ("evil.example", "/view.rrd", 403),
+    ):
+        link.request("GET", path, headers={"Host": f"{host}:{server.server_port}"})
+        answer = link.getresponse()
+        body = answer.read()
+        assert answer.status == status, path
+        if status == 200:
+            assert "connect-src 'self'" in answer.headers["Content-Security-Policy"]
+            assert body[:4] == b"RRF2"
+    link.close()
+
+
+@pytest.mark.slow
+def test_page_opens_in_chromium_and_asks_nobody_else(server):
+    """Rerun's page shows the data without an error on its console; no request leaves the machine."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: apt install chromium")
+    asked, said = [], []
+    with playwright.sync_playwright() as play:
+        flags = [
+            "--no-sandbox",
+            "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader",
+            "--ignore-gpu-blocklist",
+        ]
+        browser = play.chromium.launch(executable_path=CHROMIUM, args=flags)
+        page = browser.new_page(viewport={"width": 1200, "height": 800})
+        page.on("request", lambda r: asked.append(r.url))
+        page.on("console", lambda m: said.append(m.text) if m.type == "error" else None)
+        page.on("pageerror", lambda e: said.append(str(e)))
+        page.goto(f"http://127.0.0.1:{server.server_port}")
+        end = time.monotonic() + 120
+        while not any(url.endswith("/view.rrd") for url in asked) and time.monotonic() < end:
+            page.wait_for_timeout(500)
+        page.wait_for_timeout(5000)
+        browser.close()
+    assert said == []
+    assert any(url.endswith("/view.rrd") for url in asked)
+    assert [url for url in asked if not url.startswith(("http://127.0.0.1:", "blob:", "data:"))] == []
+
+
+def test_reports_nothing(tmp_path):
+    """The window's environment carries a configuration that says no."""
+    from tofcapture.viewer.web import quiet_environment
+
+    env = quiet_environment(tmp_path)
+    assert (
+        json.loads((Path(env["XDG_CONFIG_HOME"]) / "rerun/analytics.json").read_text())["analytics_enabled"]
+        is False
+    )
+
+
+@pytest.mark.slow
+def test_rerun_leaves_no_process_behind():
+    """The server that the page is taken from is gone afterwards."""
+    pytest.importorskip("rerun")
+    from tofcapture.viewer.web import page_files
+
+    before = _servers()
+    assert b"const own" in page_files()["/index.html"]
+    end = time.monotonic() + 10
+    while _servers() - before and time.monotonic() < end:
+        time.sleep(0.1)
+    assert _servers() <= before
+
+
+def _servers():
+    """Processes of Rerun's server."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if b"--serve-web" in path.read_bytes():
+                found.add(path.parent.name)
+        except OSError:
+            continue
+    return found

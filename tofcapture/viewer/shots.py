@@ -1,0 +1,126 @@
+"""A shot: what one view, one shard's view or one prediction has to show, whatever file it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.files.seal import partial_path
+from tofcapture.poses import Float64
+from tofcapture.rig import Rig
+
+PanelKind = Literal["depth", "amplitude", "error", "expected", "normals", "mask"]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture.
+
+    Attributes
+    ----------
+    title
+        Few words.
+    kind
+        Decides colours and unit: ``depth`` metres; ``amplitude`` raw units; ``error`` signed and ``expected`` unsigned, both
+        metres here and printed in millimetres; ``normals`` unit vectors; ``mask`` bits of ground truth.
+    values
+        (H, W), or (H, W, 3) for normals; NaN: none.
+    """
+
+    title: str
+    kind: PanelKind
+    values: NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points (N, 3) in the ToF frame, metres, and what they are drawn with (r, g, b)."""
+
+    points: NDArray[np.float32]
+    colour: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One row of a sheet, one step of the timeline.
+
+    Attributes
+    ----------
+    name
+        Scene and number.
+    panels
+        Pictures, in the order in which they are shown.
+    clouds
+        By name, in the ToF frame.
+    T_base_tof
+        (4, 4); ``None`` where no arm is known.
+    links
+        (7, 3) origins of the arm's links in the base frame, metres, from the base to the flange; ``None`` where unknown.
+    """
+
+    name: str
+    panels: Sequence[Panel]
+    clouds: Mapping[str, Cloud] = field(default_factory=dict)
+    T_base_tof: Float64 | None = None
+    links: Float64 | None = None
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What an alignment says: its words for people, and per pair of clouds (number, RMSE in metres, accepted)."""
+
+    words: str
+    pairs: Sequence[tuple[str, float, bool]] = ()
+
+
+@dataclass(frozen=True)
+class Source:
+    """Everything that a path has to show; shots are read when they are asked for.
+
+    Attributes
+    ----------
+    title
+        Kind and name.
+    names
+        Of the shots.
+    load
+        Reads shot ``i``.
+    rig
+        Where the cameras sit; ``None`` when the file does not say.
+    calibration
+        Of an alignment only.
+    """
+
+    title: str
+    names: Sequence[str]
+    load: Callable[[int], Shot]
+    rig: Rig | None = None
+    calibration: Calibration | None = None
+
+    def spread(self, most: int) -> list[int]:
+        """Numbers of at most ``most`` shots, spread evenly over all."""
+        n = len(self.names)
+        return list(range(n)) if n <= most else [round(i) for i in np.linspace(0, n - 1, most)]
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """Give a temporary name to write under; the file gets its own name when it is whole, and leaves nothing when it is not.
+
+    Parameters
+    ----------
+    path
+        What is to be written; replaced when it exists.
+    """
+    partial = partial_path(path)
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -1,0 +1,244 @@
+"""Show a Rerun file: in Rerun's window, or in a browser of this machine.
+
+Rerun by itself listens on every interface and reports how it is used, its page from the browser too. Here its window gets a
+configuration of its own that says no, and its page is served by us: on the loopback interface, with a policy that lets the browser
+ask nobody else.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.error import URLError
+from urllib.request import ProxyHandler, build_opener
+
+from tofcapture.errors import ConfigError, DeviceError
+
+LOOPBACK = "127.0.0.1"
+PORT = 9090
+_DATA = "/view.rrd"
+_ASSETS = ("/index.html", "/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico")
+_PATIENCE = 20.0  # s until Rerun's own server answers
+_POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob:; worker-src 'self' blob:"
+)
+# Whoever is asked elsewhere answers "nothing", so that the page neither reports nor complains; the policy above is the lock.
+_GUARD = """<script>
+const own = window.fetch;
+window.fetch = (what, ...rest) => new URL(what.url ?? what, location).origin === location.origin
+  ? own(what, ...rest) : Promise.resolve(new Response(null, { status: 204 }));
+</script>"""
+_TYPES = {".html": "text/html", ".js": "text/javascript", ".wasm": "application/wasm", ".ico": "image/x-icon"}
+
+
+def _program() -> str:
+    beside = Path(sys.executable).with_name("rerun")
+    found = str(beside) if beside.exists() else shutil.which("rerun")
+    if not found:
+        raise ConfigError(
+            "the viewer Rerun is not installed", hint="pip install 'tofcapture[view]', or ask for --png"
+        )
+    return found
+
+
+def quiet_environment(folder: Path) -> dict[str, str]:
+    """Environment in which Rerun reports nothing.
+
+    Parameters
+    ----------
+    folder
+        An empty folder, in which its configuration is put.
+    """
+    config = folder / "rerun" / "analytics.json"
+    config.parent.mkdir(parents=True)
+    config.write_text(
+        json.dumps({"analytics_enabled": False, "analytics_id": "", "metadata": {}}), encoding="utf-8"
+    )
+    return {**os.environ, "XDG_CONFIG_HOME": str(folder), "RUST_LOG": "error"}
+
+
+def show_window(rrd: Path) -> None:
+    """Show a file in Rerun's window until it is closed.
+
+    Parameters
+    ----------
+    rrd
+        What to show.
+
+    Raises
+    ------
+    ConfigError
+        Rerun is not installed.
+    DeviceError
+        It ends with an error, for instance because there is no screen.
+    """
+    with tempfile.TemporaryDirectory(prefix="tofcapture-view-") as folder:
+        words = [_program(), "--bind", LOOPBACK, "--port", "auto", str(rrd)]
+        done = subprocess.run(
+            words, env=quiet_environment(Path(folder)), capture_output=True, text=True, check=False
+        )
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["nothing said"])[-1][:200]
+        raise DeviceError(
+            f"Rerun's window did not open: {last}",
+            hint="no screen? use --web, --save FILE.rrd or --png FILE.png",
+        )
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
+
+
+def page_files() -> dict[str, bytes]:
+    """Rerun's page as its own server hands it out: path -> bytes, without what it would load from elsewhere.
+
+    Raises
+    ------
+    ConfigError
+        Rerun is not installed.
+    DeviceError
+        Its server does not answer.
+    """
+    with tempfile.TemporaryDirectory(prefix="tofcapture-view-") as folder:
+        port = _free_port()
+        words = [
+            _program(),
+            "--bind",
+            LOOPBACK,
+            "--port",
+            str(_free_port()),
+            "--serve-web",
+            "--web-viewer-port",
+            str(port),
+        ]
+        process = subprocess.Popen(
+            words,
+            env=quiet_environment(Path(folder)),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            files = {name: _asked(port, name) for name in _ASSETS}
+        finally:
+            os.killpg(process.pid, signal.SIGTERM)  # `rerun` is a script that starts the program proper
+            process.wait(timeout=10)
+    page = re.sub(r"<link[^>]*https://[^>]*>", "", files["/index.html"].decode())
+    files["/index.html"] = page.replace("<head>", "<head>" + _GUARD, 1).encode()
+    return files
+
+
+def _asked(port: int, name: str) -> bytes:
+    end, direct = time.monotonic() + _PATIENCE, build_opener(ProxyHandler({}))
+    while True:
+        try:
+            with direct.open(f"http://{LOOPBACK}:{port}{name}", timeout=_PATIENCE) as answer:
+                return bytes(answer.read())
+        except (URLError, OSError) as err:
+            if time.monotonic() > end:
+                raise DeviceError(
+                    f"Rerun's page did not come: {err}", hint="use --save FILE.rrd or --png FILE.png"
+                ) from err
+            time.sleep(0.1)
+
+
+class _Page(BaseHTTPRequestHandler):
+    """Hands out the page's files and the data, to this machine and under its own name only."""
+
+    def __init__(self, files: Mapping[str, bytes], rrd: Path, *args: object) -> None:
+        self.files, self.rrd = files, rrd
+        super().__init__(*args)  # type: ignore[arg-type]
+
+    def do_GET(self) -> None:
+        """Answer."""
+        if self.headers.get("Host", "").rpartition(":")[0] not in {LOOPBACK, "localhost"}:
+            self.send_error(403)  # another name that leads here: somebody else's page asks
+            return
+        path, _, query = self.path.partition("?")
+        if path == "/" and not query:
+            self._answer(
+                303,
+                b"",
+                {
+                    "Location": f"/?url=http://{self.headers['Host']}{_DATA}&hide_welcome_screen&notebook=0&persist=0"
+                },
+            )
+        elif path == _DATA:
+            self._answer(200, self.rrd.read_bytes(), {"Content-Type": "application/octet-stream"})
+        elif (name := "/index.html" if path == "/" else path) in self.files:
+            self._answer(200, self.files[name], {"Content-Type": _TYPES[Path(name).suffix]})
+        else:
+            self.send_error(404)
+
+    def _answer(self, code: int, body: bytes, headers: Mapping[str, str]) -> None:
+        self.send_response(code)
+        for name, value in {
+            **headers,
+            "Content-Length": str(len(body)),
+            "Content-Security-Policy": _POLICY,
+        }.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the name of the base class
+        """Say nothing of every request."""
+
+
+def make_server(rrd: Path, port: int = PORT) -> ThreadingHTTPServer:
+    """Server of the page on the loopback interface; ``server_port`` says where.
+
+    Parameters
+    ----------
+    rrd
+        What it shows.
+    port
+        Wanted; another one is taken when it is not free.
+
+    Raises
+    ------
+    ConfigError
+        Rerun is not installed.
+    """
+    handler = partial(_Page, page_files(), rrd)
+    try:
+        return ThreadingHTTPServer((LOOPBACK, port), handler)
+    except OSError:
+        return ThreadingHTTPServer((LOOPBACK, 0), handler)
+
+
+def show_page(rrd: Path) -> None:
+    """Serve the page until Ctrl-C, and say where.
+
+    Parameters
+    ----------
+    rrd
+        What it shows.
+
+    Raises
+    ------
+    ConfigError
+        Rerun is not installed.
+    """
+    with make_server(rrd) as server:
+        print(
+            f"open http://{LOOPBACK}:{server.server_port} in a browser of this machine; Ctrl-C ends",
+            file=sys.stderr,
+            flush=True,
+        )
+        server.serve_forever()

@@ -1,0 +1,175 @@
+"""The suites' tables as Markdown, LaTeX and HTML: millimetres, degrees, percent; the best value of a column marked."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tofcapture.files.seal import write_text
+
+
+@dataclass(frozen=True)
+class Column:
+    """Words, where the number is in a method's results, factor into the printed unit, digits; ``more``: more is better."""
+
+    words: str
+    path: tuple[str, ...]
+    factor: float = 1e3
+    digits: int = 2
+    more: bool = False
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Title, columns, and which names of weights take part besides the methods without parameters (empty: all)."""
+
+    title: str
+    columns: tuple[Column, ...]
+    names: tuple[str, ...] = ()
+
+
+def _main(pool: str) -> tuple[Column, ...]:
+    d, n = ("depth", pool), ("normal", pool)
+    return (
+        Column("ABS %", (*d, "abs"), 100),
+        Column("SQ mm", (*d, "sq"), 1e3, 3),
+        Column("RMSE mm", (*d, "rmse")),
+        Column("MAE mm", (*d, "mae")),
+        Column("normal MAE rad", (*n, "paper_normal_mae"), 1, 3),
+        Column("above 20 deg %", (*n, "paper_bad20_pct"), 1),
+    )
+
+
+def _by_region(*names: str) -> tuple[Column, ...]:
+    return tuple(
+        column
+        for name in names
+        for column in (
+            Column(f"{name}: MAE mm", ("regions", name, "depth", "pixel", "mae")),
+            Column(f"{name}: bias mm", ("regions", name, "depth", "pixel", "bias")),
+            Column(f"{name}: normals deg", ("regions", name, "normal", "pixel", "mean_deg"), 1),
+        )
+    )
+
+
+_QUALITY = (
+    *_by_region("edge", "interior"),
+    Column("precision mm", ("extra", "precision")),
+    Column("within 1 sigma %", ("extra", "coverage_1sigma"), 100, 1, more=True),
+    Column("AUSE", ("extra", "ause"), 1, 3),
+    Column("coverage %", ("depth", "pixel", "coverage"), 100, 1, more=True),
+)
+SUITES: Mapping[str, Suite] = {
+    "main": Suite("Comparison (the paper's table II)", (*_main("pixel"), *_QUALITY)),
+    "ablation": Suite("Ablation of modules (table III)", _main("pixel"), ("paper", "without-")),
+    "inputs": Suite("Inputs (table IV)", _main("pixel"), ("paper", "inputs-")),
+    "mpi": Suite("Multipath", _by_region("mpi", "no-mpi")),
+    "noise": Suite("Noise", (Column("precision mm", ("extra", "precision")), *_by_region("dark", "bright"))),
+    "indoor": Suite("Indoor scenes", _main("image")),
+}
+
+
+def cells(results: Mapping[str, Any], suite: Suite) -> list[tuple[str, list[tuple[str, bool]]]]:
+    """Rows: the method's name, and text and "is the best" of every column."""
+    methods = {
+        name: table
+        for name, table in results["methods"].items()
+        if name in ("sensor", "lf2") or not suite.names or name.startswith(suite.names)
+    }
+    columns = [_column(methods, results.get("spread", {}), c) for c in suite.columns]
+    return [(name, [column[i] for column in columns]) for i, name in enumerate(methods)]
+
+
+def _column(methods: Mapping[str, Any], spread: Mapping[str, Any], column: Column) -> list[tuple[str, bool]]:
+    values = [_value(table, column) for table in methods.values()]
+    known = [abs(v) for v in values if v is not None]
+    best = (max if column.more else min)(known, default=math.nan)
+    out = []
+    for name, value in zip(methods, values, strict=True):
+        if value is None:
+            out.append(("–", False))
+            continue
+        other = _value(spread.get(name, {}), column)
+        text = f"{value:.{column.digits}f}" + ("" if other is None else f" ± {other:.{column.digits}f}")
+        out.append((text, len(known) > 1 and abs(value) == best))
+    return out
+
+
+def _value(table: Any, column: Column) -> float | None:
+    for key in column.path:
+        table = table.get(key) if isinstance(table, Mapping) else None
+    return column.factor * float(table) if isinstance(table, int | float) and math.isfinite(table) else None
+
+
+def _markdown(results: Mapping[str, Any], suite: Suite) -> str:
+    head = ["method", *(c.words for c in suite.columns)]
+    lines = [f"## {suite.title}", "", _joined(head), _joined(["---"] * len(head))]
+    lines += [
+        _joined([name, *(f"**{t}**" if b else t for t, b in row)]) for name, row in cells(results, suite)
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _joined(row: Sequence[str]) -> str:
+    return "| " + " | ".join(row) + " |"
+
+
+def _latex(results: Mapping[str, Any], suite: Suite) -> str:
+    def line(row: Sequence[str]) -> str:
+        safe = (
+            x.replace("%", r"\%").replace("_", r"\_").replace("±", r"$\pm$").replace("–", "--") for x in row
+        )
+        return " & ".join(safe) + r" \\"
+
+    rows = [
+        line([name, *(rf"\textbf{{{t}}}" if b else t for t, b in row)]) for name, row in cells(results, suite)
+    ]
+    head = line(["method", *(c.words for c in suite.columns)])
+    start = rf"\begin{{tabular}}{{l{'r' * len(suite.columns)}}}"
+    return "\n".join(
+        [f"% {suite.title}", start, r"\hline", head, r"\hline", *rows, r"\hline", r"\end{tabular}", ""]
+    )
+
+
+def _html(results: Mapping[str, Any], suite: Suite) -> str:
+    head = "".join(f"<th>{html.escape(x)}</th>" for x in ("method", *(c.words for c in suite.columns)))
+    rows = "".join(
+        f"<tr><th>{html.escape(name)}</th>"
+        + "".join(f"<td>{'<b>' if b else ''}{html.escape(t)}{'</b>' if b else ''}</td>" for t, b in row)
+        + "</tr>\n"
+        for name, row in cells(results, suite)
+    )
+    return f"<h2>{html.escape(suite.title)}</h2>\n<table><tr>{head}</tr>\n{rows}</table>\n"
+
+
+WRITERS: Mapping[str, tuple[Callable[[Mapping[str, Any], Suite], str], str, str]] = {
+    "md": (_markdown, "", ""),
+    "tex": (_latex, "", ""),
+    "html": (
+        _html,
+        (
+            '<!doctype html><html lang="en"><meta charset="utf-8"><title>Tables</title>\n'
+            "<style>td,th{padding:.2em .6em;text-align:right}body{font-family:sans-serif}</style>\n"
+        ),
+        "</html>\n",
+    ),
+}
+
+
+def markdown(results: Mapping[str, Any], names: Sequence[str]) -> str:
+    """Print the suites' tables for people."""
+    return "\n".join(_markdown(results, SUITES[name]) for name in names)
+
+
+def write_tables(out: Path, results: Mapping[str, Any], names: Sequence[str]) -> list[Path]:
+    """Write ``tables.md``, ``.tex`` and ``.html`` beside ``out``."""
+    paths = []
+    for kind, (writer, start, end) in WRITERS.items():
+        path = out.with_name(f"tables.{kind}")
+        write_text(path, start + "\n".join(writer(results, SUITES[name]) for name in names) + end)
+        paths.append(path)
+    return paths

@@ -1,0 +1,71 @@
+"""Every network that a configuration can name, behind one interface: build it, choose what learns, hold it against the truth."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from tofcapture_model.baselines.coarse_fine import CoarseFine
+from tofcapture_model.baselines.guo2018 import MRM
+from tofcapture_model.baselines.protocol import Baseline
+from tofcapture_model.baselines.su2018 import ToFNet
+from tofcapture_model.config import Config, Losses
+from tofcapture_model.frame import Estimate, Frame, Target
+from tofcapture_model.geometry import scale_intrinsics
+from tofcapture_model.joint import JointModel
+from tofcapture_model.losses import Objective, objective
+
+Model = JointModel | Baseline
+
+PARTS = {
+    "depth": ("raw2depth", "error_map"),
+    "normal": ("raw2normal",),
+    "refine": ("refinement",),
+    "joint": ("backbone", "raw2depth", "error_map", "raw2normal", "refinement"),
+}
+
+
+def build_model(config: Config) -> Model:
+    """Build the model of a configuration, in channels-last memory order (a third faster on CPU)."""
+    network = config.network
+    model: Model
+    if network.kind == "su2018":
+        model = ToFNet(network.width)
+    elif network.kind == "guo2018":
+        model = MRM()
+    elif network.kind == "coarse-fine":
+        model = CoarseFine()
+    else:
+        model = JointModel(network)
+    return model.to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
+
+
+def select_stage(model: Model, stage: str) -> list[nn.Parameter]:
+    """Freeze all parameters but those that learn in ``stage``; return these. All of a baseline learn in its only stage."""
+    learning = []
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(isinstance(model, Baseline) or name.split(".")[0] in PARTS[stage])
+        learning += [parameter] if parameter.requires_grad else []
+    return learning
+
+
+def training_loss(
+    model: Model, weights: Losses, stage: str, estimate: Estimate, target: Target, frame: Frame
+) -> Objective:
+    """What a step lowers: the paper's losses for our model, a baseline's own for a baseline.
+
+    Parameters
+    ----------
+    model
+        Which answered.
+    weights, stage
+        As in :func:`tofcapture_model.losses.objective`; a baseline looks at neither.
+    estimate, target
+        At (2H, 2W).
+    frame
+        (B, ., H, W), what the model read.
+    """
+    if isinstance(model, Baseline):
+        loss = model.loss(estimate, target, frame)
+        return Objective(loss, {"depth": loss}, torch.zeros(7))
+    return objective(weights, stage, estimate, target, scale_intrinsics(frame.intrinsics, 2))
