@@ -25,7 +25,7 @@ demo: $(STAMP)
 	$(VENV)/bin/tofcapture demo --out demo-out
 
 test: $(STAMP)
-	$(VENV)/bin/python -m pytest
+	$(VENV)/bin/python -m pytest -n 2
 
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .
