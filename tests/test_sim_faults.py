@@ -110,3 +110,18 @@ def test_wrong_tables_are_explained(table, message):
     """Misspelt keys and wrong values are errors that name them."""
     with pytest.raises(ConfigError, match=message):
         read_faults(table)
+
+
+def test_a_recording_goes_on_once_its_faults_are_lifted(tmp_path):
+    """Stereo never answers and the run gives up; the same command without the faults finishes the recording."""
+    from tests.test_recorder import _small_station
+    from tofcapture.cli import main
+
+    station = _small_station(tmp_path)
+    sound = station.read_text()
+    command = ["record", "--scene", "box", "--views", "2", "--frames", "1", "--foreground"]
+    command += ["--station", str(station), "--out", str(tmp_path / "rec")]
+    station.write_text(f"{sound}\n[sim.faults]\nstereo_fails = {list(range(99))}\n")
+    assert main(command) == DeviceError.exit_code
+    station.write_text(sound)
+    assert main(command) == 0

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -116,9 +117,7 @@ def record(
     try:
         _begin(recording, station)
         with hold(recording), hold_arm(station.arm), closing(Journal(recording)) as journal:
-            journal.agree(
-                {"station": station.describe(), "frames": frames, "sim": station.config.get("sim", {})}
-            )
+            journal.agree({"station": station.describe(), "frames": frames, "sim": _world(station)})
             repaired = reconcile(journal, recording, scene)
             kept = journal.expect(scene, {view.index: view.digest for view in plan.views})
             watch.planned(plan, kept, repaired)
@@ -143,6 +142,11 @@ def record(
         plan=plan,
         notes=tuple(notes),
     )
+
+
+def _world(station: Station) -> dict[str, Any]:
+    """What a simulated world is made of; faults on demand come and go without making it another."""
+    return {key: value for key, value in station.config.get("sim", {}).items() if key != "faults"}
 
 
 def _check_turns(station: Station, plan: Plan) -> None:
