@@ -42,6 +42,17 @@ def test_the_card_is_a_datasheet(tmp_path):
     assert "Simulated" not in measured.read_text(encoding="utf-8")
 
 
+def test_card_and_description_name_the_scales(tmp_path):
+    """Ground truth at 4x is listed where it was built, and only there."""
+    for scales, words in (((1, 2), "1x and 2x"), ((1, 2, 4), "1x, 2x and 4x")):
+        folder = make(tmp_path / f"{len(scales)}", scales=scales)
+        text = (folder / "README.md").read_text(encoding="utf-8")
+        assert f"`/gt/mask_*`: ground truth at {words}, and" in text
+        assert f"onto the ToF plane at {words}." in text
+        about = json.loads((folder / "croissant.json").read_text(encoding="utf-8"))["description"]
+        assert ("ground truth at 1x, 2x and 4x (" in about) == (4 in scales)
+
+
 def test_the_description_holds_the_manifest_and_every_shard(tmp_path):
     """Digests are those of the files; scenes and splits are rows of its record set; check finds nothing amiss in it."""
     folder = make(tmp_path / "data")

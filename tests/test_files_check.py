@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 import pytest
 
+from tests.test_files_shard import write
 from tofcapture.dataset.build import build_dataset
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
 from tofcapture.devices.sim.world import SimWorld, read_constants
@@ -185,6 +186,33 @@ def test_broken_rules_of_a_shard_are_named(here, damage):
     path = here / "dataset/shards/box.h5"
     edit(path, change)
     assert where in {p.where for p in check(path)}
+
+
+FINE_DAMAGE = {
+    "none": (lambda _: None, None),
+    "depth missing": (delete("gt/depth_4x"), "/gt/depth_4x"),
+    "mask missing": (delete("gt/mask_4x"), "/gt/mask_4x"),
+    "only the mask": (lambda f: [delete(f"gt/{n}_4x")(f) for n in ("depth", "normals")], "/gt/normals_4x"),
+    "shape": (replaced("gt/depth_4x", np.ones((2, 12, 16), np.float32)), "/gt/depth_4x"),
+    "hit without depth": (set_array("gt/mask_4x", (1, slice(None)), 0), "/gt/mask_4x[1]"),
+    "depth of zero": (set_array("gt/depth_4x", (1, 3, 4), 0.0), "/gt/depth_4x[1]"),
+    "unit": (
+        lambda f: f["gt/normals_4x"].__setitem__((...), 2 * f["gt/normals_4x"][()]),
+        "/gt/normals_4x[0]",
+    ),
+    "all gone": (lambda f: [delete(f"gt/{n}_4x")(f) for n in ("depth", "normals", "mask")], None),
+}
+
+
+@pytest.mark.parametrize("damage", FINE_DAMAGE)
+def test_ground_truth_at_four_times_obeys_the_same_rules(tmp_path, damage):
+    """It is there whole or not at all, four times the image's size, depth where hit, unit normals."""
+    change, where = FINE_DAMAGE[damage]
+    path = tmp_path / "mug.h5"
+    write(path, scales=(1, 2, 4))
+    edit(path, change)
+    found = {p.where for p in check(path)}
+    assert where in found if where else not found
 
 
 def test_normals_must_be_unit_and_face_the_camera(here):

@@ -43,7 +43,7 @@ def truth_at(scale, rng):
     return GroundTruth(depth, normals, mask)
 
 
-def make_sample(index, *, exact=True):
+def make_sample(index, *, exact=True, scales=(1, 2)):
     rng = np.random.default_rng(index)
     plane = (1 / (1 + 0.2 * STEREO.rays[..., 0])).astype(np.float32)
     exact_maps = ExactMaps(rng.random((12, 16), np.float32) + 1, truth_at(2, rng).normals)
@@ -56,7 +56,7 @@ def make_sample(index, *, exact=True):
             np.full((6, 8), 0.9, np.float32), rng.random((6, 8), np.float32), rng.random((6, 8)) < 0.1
         ),
         native_depth=plane,
-        ground_truth={1: truth_at(1, rng), 2: truth_at(2, rng)},
+        ground_truth={scale: truth_at(scale, rng) for scale in scales},
         T_base_tof=exp(0.1 * rng.normal(size=6)),
         truth=exact_maps if exact else None,
     )
@@ -93,6 +93,30 @@ def test_round_trip(tmp_path):
                     expected = getattr(sample.ground_truth[scale], name)
                     np.testing.assert_array_equal(getattr(shard.ground_truth(view, scale), name), expected)
             np.testing.assert_array_equal(shard.truth(view).depth, sample.truth.depth)
+
+
+def test_ground_truth_at_four_times_where_it_was_built(tmp_path):
+    """It comes back bit by bit; a shard without it says how to build it; views that disagree on it are refused."""
+    path = tmp_path / "mug.h5"
+    write(path, scales=(1, 2, 4))
+    with ShardReader(path) as shard:
+        assert shard.scales == (1, 2, 4)
+        for view, sample in enumerate(make_sample(i, scales=(1, 2, 4)) for i in (0, 3)):
+            for name in ("depth", "normals", "mask"):
+                expected = getattr(sample.ground_truth[4], name)
+                np.testing.assert_array_equal(getattr(shard.ground_truth(view, 4), name), expected)
+        assert shard.points(0, 4).shape == (24, 32, 3)
+    write(tmp_path / "box.h5", scene="box")
+    with ShardReader(tmp_path / "box.h5") as shard:
+        assert shard.scales == (1, 2)
+        with pytest.raises(DataError, match="4x, it is there at 1x and 2x") as caught:
+            shard.ground_truth(0, 4)
+        assert "build-dataset RECORDING --out DATASET --scales 1 2 4" in caught.value.hint
+    info = StereoInfo("stereo", "2", STEREO)
+    with ShardWriter(tmp_path / "odd.h5", "odd", RIG, INFO, info, 2) as writer:
+        writer.add(make_sample(0, scales=(1, 2, 4)))
+        with pytest.raises(FormatError, match="gt/depth_4x"):
+            writer.add(make_sample(1))
 
 
 def test_derived_arrays(tmp_path):
@@ -275,6 +299,9 @@ def test_the_layouts_are_pinned():
         "gt/depth_2x": "float32 N 2H 2W",
         "gt/normals_2x": "float32 N 2H 2W 3",
         "gt/mask_2x": "uint8 N 2H 2W",
+        "gt/depth_4x": "float32 N 4H 4W ?",
+        "gt/normals_4x": "float32 N 4H 4W 3 ?",
+        "gt/mask_4x": "uint8 N 4H 4W ?",
         "views/T_base_tof": "float64 N 4 4",
         "views/index": "int64 N",
         "truth/depth_2x": "float32 N 2H 2W ?",

@@ -36,6 +36,7 @@ ORDER = (
     "migrate",
     "stats",
     "view",
+    "figure",
     "pack",
     "export-dataset",
     "train",

@@ -33,6 +33,15 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         "--crop-radius", type=float, metavar="M", help="object within this radius, metres (default: 0.35)"
     )
     parser.add_argument("--far", type=float, metavar="M", help="deepest ground truth, metres (default: 2.0)")
+    parser.add_argument(
+        "--scales",
+        nargs="+",
+        type=int,
+        choices=(1, 2, 4),
+        default=(1, 2),
+        metavar="S",
+        help="resolutions of the ground truth, in ToF images: 1 2 4 adds 4x (default: 1 2, which are always there)",
+    )
     parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core, at most 4)")
     parser.add_argument(
         "--engine", choices=("process", "dask"), default="process", help="who builds (default: process)"
@@ -84,9 +93,13 @@ def _positive(value: float | None, name: str) -> dict[str, Any]:
 def _run(args: argparse.Namespace) -> Outcome:
     from tofcapture.dataset.build import Share, build_dataset
     from tofcapture.dataset.recordings import find_scenes
-    from tofcapture.dataset.sample import SampleConfig
+    from tofcapture.dataset.sample import SCALES, SampleConfig
 
-    config = SampleConfig(**_positive(args.crop_radius, "crop_radius"), **_positive(args.far, "far"))
+    config = SampleConfig(
+        **_positive(args.crop_radius, "crop_radius"),
+        **_positive(args.far, "far"),
+        scales=tuple(sorted({*SCALES, *args.scales})),
+    )
     _positive(args.jobs, "jobs")
     start = time.monotonic()
     total = sum(len(views) for _, views in find_scenes(args.recordings).values())

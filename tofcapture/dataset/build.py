@@ -10,7 +10,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from tofcapture.dataset.card import write_card
@@ -221,7 +221,7 @@ def _finish(out: Path, entries: Mapping[str, SceneEntry], config: SampleConfig) 
         for work in (out / "shards").glob(f"{WORK}*"):
             shutil.rmtree(work, ignore_errors=True)
         gt = pooled_error(out / e.path for e in entries.values())
-        manifest = Manifest(entries, asdict(config), versions())
+        manifest = Manifest(entries, config.table(), versions())
         write_manifest(out, manifest)
         write_card(out, manifest, None if gt is None else gt.table())
     (out / ".finish.lock").unlink(missing_ok=True)

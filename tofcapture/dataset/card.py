@@ -12,7 +12,7 @@ from tofcapture.dataset.croissant import croissant
 from tofcapture.files.layout import SPLITS
 from tofcapture.files.manifest import Manifest, manifest_path, object_of
 from tofcapture.files.seal import sha256_of, write_text
-from tofcapture.files.shard import ShardReader
+from tofcapture.files.shard import ShardReader, scales_text
 
 _FRONT = """\
 ---
@@ -87,6 +87,7 @@ def _of_first(dataset: Path, manifest: Manifest) -> dict[str, Any]:
             "SH": SH,
             "SW": SW,
             "first": entry.path,
+            "scales": scales_text(shard.scales),
             "collection": _SIMULATED if simulated else _MEASURED,
             "truth": "\n- `/truth/*`: exact depth and normals at 2x, of the simulator." if simulated else "",
         }

@@ -8,6 +8,7 @@ from typing import Any
 from tofcapture.files.layout import SHARD
 from tofcapture.files.manifest import Manifest, manifest_path
 from tofcapture.files.seal import sha256_of
+from tofcapture.files.shard import ShardReader, scales_text
 
 CONFORMS = "http://mlcommons.org/croissant/1.0"
 
@@ -78,6 +79,11 @@ def croissant(dataset: Path, manifest: Manifest) -> dict[str, Any]:
     the data do not tell (licence, authors, citation) is left out, never invented. Croissant has no reader for HDF5, so arrays are
     not fields; ``docs/formats.md`` describes them.
     """
+    about = "Raw time-of-flight phase images with stereo ground truth"
+    entry = manifest.scenes[min(manifest.scenes)]
+    with ShardReader(dataset / entry.path, entry.sha256) as shard:
+        if 4 in shard.scales:
+            about += f" at {scales_text(shard.scales)}"
     files = [
         _file(
             "manifest",
@@ -104,7 +110,7 @@ def croissant(dataset: Path, manifest: Manifest) -> dict[str, Any]:
         "@type": "sc:Dataset",
         "conformsTo": CONFORMS,
         "name": dataset.resolve().name,
-        "description": f"Raw time-of-flight phase images with stereo ground truth ({SHARD.format} {SHARD.version}).",
+        "description": f"{about} ({SHARD.format} {SHARD.version}).",
         "keywords": ["time-of-flight", "depth", "surface normals"],
         "distribution": files,
         "recordSet": [_scenes(manifest)],

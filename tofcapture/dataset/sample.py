@@ -6,12 +6,13 @@ import json
 import threading
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.errors import DataError
+from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.hdf import dumps
 from tofcapture.files.info import tof_from, tof_table
 from tofcapture.files.layout import MaskBit
@@ -26,7 +27,8 @@ from tofcapture.ops.register import register
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig
 
-SCALES = (1, 2)
+SCALES = (1, 2)  # always there
+FINEST = (*SCALES, 4)
 SPARSE = 4  # pixels of the stereo grid between points that vote for the table
 WITHIN = 4.0  # standard deviations by which a triangle may miss the plane through its surroundings
 
@@ -42,10 +44,28 @@ class SampleConfig:
         everything is the object: no table is looked for and no pixel is OUTSIDE.
     far
         Largest depth of ground truth in the ToF frame, metres.
+    scales
+        Of the ToF image's resolution, that ground truth is made at: 1 and 2, or 1, 2 and 4.
+
+    Raises
+    ------
+    ConfigError
+        For other scales.
     """
 
     crop_radius: float = 0.35
     far: float = 2.0
+    scales: tuple[int, ...] = SCALES
+
+    def __post_init__(self) -> None:
+        if tuple(self.scales) not in (SCALES, FINEST):
+            raise ConfigError(f"scales: expected {SCALES} or {FINEST}, got {self.scales}")
+        object.__setattr__(self, "scales", tuple(self.scales))
+
+    def table(self) -> dict[str, Any]:
+        """As JSON types; the scales only where they are not the default, which shards have always had."""
+        table: dict[str, Any] = {"crop_radius": self.crop_radius, "far": self.far}
+        return table if self.scales == SCALES else {**table, "scales": list(self.scales)}
 
 
 def make_sample(
@@ -90,7 +110,7 @@ def make_sample(
         _sparse_points(native, rig, config.far), T_base_tof[2, :3], rng, config.crop_radius, config.far
     )
     truths = {}
-    for scale in SCALES:
+    for scale in config.scales:
         camera = rig.tof.scaled(scale)
         projection = project(sheet, rig.stereo, rig.T_tof_stereo, camera, edge_pixels=scale, far=config.far)
         truths[scale] = assemble(smoothed(projection, field, rig, camera), rig, camera, crop)

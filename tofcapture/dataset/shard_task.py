@@ -15,7 +15,7 @@ import sys
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -74,7 +74,7 @@ class SceneTask:
             "scene": self.scene,
             "inputs": inputs,
             "rig": dumps_rig(self.rig),
-            "config": asdict(self.config),
+            "config": self.config.table(),
             "layout": [SHARD.format, SHARD.version],
             "versions": versions(),
         }
@@ -167,7 +167,7 @@ def _provenance(
     return {
         **({} if objects is None else {"objects": list(objects)}),
         "digest": task.digest(inputs),
-        "config": asdict(task.config),
+        "config": task.config.table(),
         "versions": versions(),
         "views": [
             {"name": path.name, "sha256": digest, "good_pixels": pixels}

@@ -137,7 +137,8 @@ def _check_open(file: h5py.File, path: Path) -> Iterator[Problem]:
         return
     whole = True
     for field in layout:
-        for problem in _check_field(file, field, _sizes(file, info, path), path):
+        expected = _expected(file, field, layout)
+        for problem in _check_field(file, field, _sizes(file, info, path), path, expected=expected):
             whole = False
             yield problem
     if whole:
@@ -180,18 +181,28 @@ def _sizes(file: h5py.File, info: TofInfo, path: Path) -> dict[str, int]:
     return {"N": N, "F": F, "K": len(info.modulation_hz), "H": H, "W": W, "SH": SH, "SW": SW}
 
 
-def _check_field(file: h5py.File, field: Field, sizes: dict[str, int], path: Path) -> Iterator[Problem]:
+def _expected(file: h5py.File, field: Field, layout: Layout) -> bool:
+    """Whether a dataset has to be there; the optional ones of a group are there together or not at all."""
+    group = field.path.split("/", maxsplit=1)[0]
+    mates = [f for f in layout if f.path.startswith(f"{group}/")]
+    if all(f.optional for f in mates):
+        return group in file
+    return not field.optional or any(f.optional and f.path in file for f in mates)
+
+
+def _check_field(
+    file: h5py.File, field: Field, sizes: dict[str, int], path: Path, *, expected: bool
+) -> Iterator[Problem]:
     dataset, where = file.get(field.path), f"/{field.path}"
     if not isinstance(dataset, h5py.Dataset):
-        group = field.path.split("/", maxsplit=1)[0]
-        if not field.optional or group in file:
+        if expected:
             yield Problem(path, where, "expected a dataset, found none", _AGAIN)
         return
     if dataset.attrs.get("units") != field.units:
         yield Problem(path, where, f"expected units {field.units!r}, got {dataset.attrs.get('units')!r}")
     if dataset.dtype.name not in field.dtypes or dataset.shape != field.shape(sizes):
-        expected = f"{' or '.join(field.dtypes)} {field.shape(sizes)}"
-        yield Problem(path, where, f"expected {expected}, got {dataset.dtype.name} {dataset.shape}")
+        right = f"{' or '.join(field.dtypes)} {field.shape(sizes)}"
+        yield Problem(path, where, f"expected {right}, got {dataset.dtype.name} {dataset.shape}")
         return
     try:
         if field.chunk:
@@ -223,6 +234,7 @@ def _shard_rules(file: h5py.File, info: TofInfo) -> Iterator[content.Finding]:
     yield from content.rigid(file, "views/T_base_tof")
     yield from content.increasing(file, "tof/time_ns")
     yield from content.saturated_or_not(file, "tof/raw", info.saturation)
+    scales = (1, 2, 4) if "gt/depth_4x" in file else (1, 2)
     for view in range(file["tof/raw"].shape[0]):
         for name in ("tof/depth", "gt/native_depth"):
             depth = file[name][view]
@@ -230,7 +242,7 @@ def _shard_rules(file: h5py.File, info: TofInfo) -> Iterator[content.Finding]:
             yield from content.near(f"/{name}[{view}]", depth)
         yield from content.amplitude(f"/tof/confidence[{view}]", file["tof/confidence"][view])
         yield from content.flagged(f"/tof/flags[{view}]", file["tof/flags"][view])
-        for scale in (1, 2):
+        for scale in scales:
             yield from _projected_rules(file, view, scale, info)
 
 

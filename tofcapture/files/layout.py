@@ -70,7 +70,7 @@ class Field:
     chunk
         Number of leading dims with one entry per chunk; ``None`` stores small data contiguously and unfiltered.
     optional
-        May be absent.
+        May be absent, with all other optional datasets of its group.
     """
 
     path: str
@@ -247,6 +247,7 @@ SHARD = Layout(
         ),
         *_projected(1),
         *_projected(2),
+        *(replace(field, optional=True) for field in _projected(4)),
         Field(
             "views/T_base_tof",
             _F64,

@@ -84,7 +84,7 @@ class Sample:
     native_depth
         (SH, SW) float32, cropped and denoised stereo depth, stereo frame; NaN: none.
     ground_truth
-        By scale, 1 and 2.
+        By scale: 1 and 2, and 4 where it is wanted.
     T_base_tof
         (4, 4), from the measured joints.
     truth

@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -34,8 +35,14 @@ from tofcapture.rig import Rig, loads_rig
 
 __all__ = ["ExactMaps", "GroundTruth", "Sample", "Scale", "ShardReader", "TofMaps"]
 
-Scale = Literal[1, 2]
+Scale = Literal[1, 2, 4]
 _CHECK = "tofcapture check says what is damaged"
+
+
+def scales_text(scales: Sequence[int]) -> str:
+    """Scales in words: ``1x and 2x``."""
+    *others, last = (f"{scale}x" for scale in scales)
+    return f"{', '.join(others)} and {last}"
 
 
 class ShardReader:
@@ -191,8 +198,24 @@ class ShardReader:
         name = "tof/flags" if self.version > SHARD_1.version else "tof/saturated"
         return self._row(name, view).astype(np.uint8, copy=False)
 
+    @cached_property
+    def scales(self) -> tuple[Scale, ...]:
+        """Multiples of the ToF image's resolution that there is ground truth at: 1 and 2, and 4 where it was built."""
+        return (1, 2, 4) if "gt/depth_4x" in self._open() else (1, 2)
+
     def ground_truth(self, view: int, scale: Scale) -> GroundTruth:
-        """Depth, normals and mask at 1x or 2x of the ToF image."""
+        """Depth, normals and mask at 1x, 2x or, where it was built, 4x of the ToF image.
+
+        Raises
+        ------
+        DataError
+            When the shard has none at that scale.
+        """
+        if scale not in (1, 2) and scale not in self.scales:
+            raise DataError(
+                f"{self.path}: expected ground truth at {scale}x, it is there at {scales_text(self.scales)}",
+                hint="tofcapture build-dataset RECORDING --out DATASET --scales 1 2 4 builds 1x, 2x and 4x",
+            )
         return GroundTruth(*(self._row(f"gt/{name}_{scale}x", view) for name in ("depth", "normals", "mask")))
 
     def native(self, view: int) -> Float32:

@@ -30,6 +30,8 @@ TALLEST = 0.4  # m; a parallel plane further below a flat top is the floor, not 
 ABOVE = 3.0  # standard deviations of the table's points; one in 700 of them is higher
 LOWEST = 0.0008  # m; single points are no surer of a table
 LOWEST_SMOOTH = 0.00025  # m; nor are depths of planes that were fitted to many
+FINEST = 0.00015  # m; the same where the table's scatter is so small that SURE of it are less
+SURE = 12.0  # standard deviations: beside things, smoothed points scatter more than the table at large
 WHOLE = 100.0  # m; a crop of this radius or more is no crop
 ABOVE_SMOOTH = 4.0  # standard deviations of smoothed points; a small far object has a hundred times fewer pixels than its table
 FEWEST = 500  # table points that tell its scatter
@@ -214,8 +216,8 @@ def lowered(crop: Crop, points: NDArray[np.floating]) -> Crop:
     Returns
     -------
     Crop
-        The same with a clearance of four standard deviations (1.48 MAD) of the points that the crop takes for table, never
-        more than before.
+        The same with a clearance of four standard deviations (1.48 MAD) of the points that the crop takes for table, at least
+        a quarter of a millimetre or, from close by, twelve of them; never more than before.
     """
     if not np.isfinite(crop.offset):
         return crop
@@ -225,7 +227,8 @@ def lowered(crop: Crop, points: NDArray[np.floating]) -> Crop:
         return crop
     middle = np.median(height)
     scatter = 1.4826 * float(np.median(np.abs(height - middle)))
-    clearance = max(LOWEST_SMOOTH, float(middle) + ABOVE_SMOOTH * scatter)
+    least = min(LOWEST_SMOOTH, max(FINEST, SURE * scatter))
+    clearance = max(least, float(middle) + ABOVE_SMOOTH * scatter)
     return replace(crop, clearance=min(crop.clearance, clearance))
 
 

@@ -44,11 +44,15 @@ class Sheet:
         (SH, SW) bool, measured, or interpolated across a small hole of a smooth surface.
     surface
         (SH-1, SW-1) bool, the quad between four neighbours is surface; other quads with four depths are skirt.
+    doubtful
+        (SH, SW) bool, interpolated across a small hole whose ends differ by more than neighbours on one surface can: a step
+        may hide in it.
     """
 
     depth: Float64
     vertex: Bool
     surface: Bool
+    doubtful: Bool
 
 
 @dataclass(frozen=True)
@@ -96,11 +100,11 @@ def triangulate(depth: NDArray[np.floating], camera: Camera) -> Sheet:
         raise DataError(f"triangulate: expected depth of shape {camera.shape}, got {depth.shape}")
     steepest = STEEPEST / min(camera.fx, camera.fy)
     z = np.array(depth, dtype=np.float64, order="C")
-    vertex = np.empty(z.shape, dtype=bool)
-    bridge(z, vertex, steepest, FILLED_GAP)
+    vertex, doubtful = np.empty(z.shape, dtype=bool), np.zeros(z.shape, dtype=bool)
+    bridge(z, vertex, doubtful, steepest, FILLED_GAP)
     surface = np.empty((z.shape[0] - 1, z.shape[1] - 1), dtype=bool)
     cut(z, vertex, surface, steepest)
-    return Sheet(z, vertex, surface)
+    return Sheet(z, vertex, surface, doubtful)
 
 
 def _dilate(mask: Bool, radius: int) -> Bool:
@@ -172,13 +176,14 @@ def project(
     camera
         Intrinsics on the ToF plane, any size.
     edge_pixels
-        Pixels this near to a depth edge or to a pixel without surface are marked.
+        Pixels this near to a depth edge or to a pixel without surface are marked, and so is a pixel whose surface is
+        interpolated where a step may hide.
     far
         Points deeper than this in the ToF frame are no surface, metres.
     """
     if camera.distortion:
         return _through_lens(sheet, stereo, T_tof_stereo, camera, edge_pixels, far)
-    from tofcapture.ops.kernels.sheet import borders, render, unseen
+    from tofcapture.ops.kernels.sheet import borders, invented, render, unseen
 
     eye = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     x, y = _axes(stereo)
@@ -190,6 +195,9 @@ def project(
     depth = np.ascontiguousarray(image[..., 0])
     border = np.zeros(camera.shape, dtype=bool)
     borders(sheet.depth, sheet.vertex, sheet.surface, x, y, T_tof_stereo, far, eye, depth, border)
+    edge = _dilate(np.isnan(depth) | border | _jumps(depth, camera), edge_pixels)
+    # Those beside it hit measured surface: marking them too would cost small far objects half of their pixels.
+    invented(sheet.doubtful, image[..., 1:3], edge)
     hidden = skirt.reshape(camera.shape)
     aside = np.zeros(camera.shape, dtype=bool)
     if np.isfinite(depth).any():
@@ -200,5 +208,5 @@ def project(
         pixels=image[..., 1:3],
         normals=image[..., 3:6],
         occluded=aside | (np.isfinite(hidden) & ~(hidden > depth * (1 - HIDES) - HIDES)),
-        edge=_dilate(np.isnan(depth) | border | _jumps(depth, camera), edge_pixels),
+        edge=edge,
     )

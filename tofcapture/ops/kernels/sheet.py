@@ -12,23 +12,29 @@ Bool = NDArray[np.bool_]
 
 
 @compiled
-def bridge(z: Float64, vertex: Bool, steepest: float, filled_gap: int) -> None:
-    """Fill holes of rows linearly in inverse depth, in place; small fills of a smooth surface become vertices."""
+def bridge(z: Float64, vertex: Bool, doubtful: Bool, steepest: float, filled_gap: int) -> None:
+    """Fill holes of rows linearly in inverse depth, in place; small fills of a smooth surface become vertices.
+
+    Those are ``doubtful`` where the hole is wide enough to hide a step that would have been cut between neighbours.
+    """
     height, width = z.shape
     for v in range(height):
         last = -1
         for b in range(width):
             zb = z[v, b]
             vertex[v, b] = np.isfinite(zb)
+            doubtful[v, b] = False
             if not vertex[v, b]:
                 continue
             if last >= 0 and b - last > 1:
                 za, span = z[v, last], b - last
-                smooth = span - 1 <= filled_gap and abs(za - zb) <= steepest * min(za, zb) * span
+                step, limit = abs(za - zb), steepest * min(za, zb)
+                smooth = span - 1 <= filled_gap and step <= limit * span
                 for u in range(last + 1, b):
                     t = (u - last) / span
                     z[v, u] = 1 / ((1 - t) / za + t / zb)
                     vertex[v, u] = smooth
+                    doubtful[v, u] = smooth and step > limit
             last = b
 
 
@@ -193,6 +199,18 @@ def borders(
             pu, pv = int(np.rint(s[0, 0])), int(np.rint(s[0, 1]))
             if 0 <= pu < width and 0 <= pv < height and not (p[0, 2] > depth[pv, pu] * 1.01 + 0.005):
                 mark[pv, pu] = True
+
+
+@compiled
+def invented(doubtful: Bool, pixels: Float64, mark: Bool) -> None:
+    """Mark the pixels (H, W) whose hit ``pixels`` (H, W, 2) lies on a quad with a doubtful corner."""
+    rows, columns = doubtful.shape
+    for pv in range(mark.shape[0]):
+        for pu in range(mark.shape[1]):
+            if np.isfinite(pixels[pv, pu, 0]):
+                u, v = min(int(pixels[pv, pu, 0]), columns - 2), min(int(pixels[pv, pu, 1]), rows - 2)
+                above = doubtful[v, u] or doubtful[v, u + 1]
+                mark[pv, pu] |= above or doubtful[v + 1, u] or doubtful[v + 1, u + 1]
 
 
 @compiled
