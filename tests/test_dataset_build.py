@@ -13,9 +13,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tofcapture.cli import main
 from tofcapture.dataset.build import build_dataset
 from tofcapture.dataset.sample import SampleConfig, assemble, make_sample
 from tofcapture.dataset.truth import class_errors, crop_shares, ground_truth_error
+from tofcapture.devices.sim.light import exact_view
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
 from tofcapture.devices.sim.world import SimWorld, read_constants
 from tofcapture.errors import ConfigError, DataError
@@ -41,7 +43,8 @@ SMALL = {
 CONFIG = SampleConfig()
 
 
-def simulate(scene, index, distance=0.5, constants=SMALL):
+def placed(scene, index, distance=0.5, constants=SMALL):
+    """World with the arm where view ``index`` of a scene is taken; flange to base."""
     world = SimWorld(read_constants(constants, "test"), 0, scene_objects)
     target = np.asarray(TABLE_CENTRE) + np.array([0, 0, 0.03])
     direction = np.array([0.3 * (index - 1), 0.3, 0.9])
@@ -49,6 +52,11 @@ def simulate(scene, index, distance=0.5, constants=SMALL):
     T_base_flange = T_base_tof @ invert(world.true_rig.T_flange_tof)
     world.place(scene)
     world.set_pose(T_base_flange, bytes([index]))
+    return world, T_base_flange
+
+
+def simulate(scene, index, distance=0.5, constants=SMALL):
+    world, T_base_flange = placed(scene, index, distance, constants)
     times = iter(range(1, 10**9, 10**6))
     burst, stereo = world.tof(2, times.__next__), world.stereo(times.__next__)
     state = ArmState(np.zeros(6), T_base_flange, 5)
@@ -71,6 +79,11 @@ def view():
 @pytest.fixture(scope="module")
 def sample(view):
     return make_sample(view, true_rig(view), CONFIG, rng())
+
+
+@pytest.fixture(scope="module")
+def fine(view):
+    return make_sample(view, true_rig(view), SampleConfig(scales=(1, 2, 4)), rng())
 
 
 @pytest.fixture(scope="module")
@@ -121,10 +134,10 @@ def test_good_pixels_are_the_object(view, sample):
     assert np.median(np.abs(gt.depth - view.truth.depth)[table]) < 0.001
 
 
-@pytest.mark.parametrize("scale", [1, 2])
-def test_depth_normals_and_mask_obey_the_contract(sample, view, scale):
+@pytest.mark.parametrize("scale", [1, 2, 4])
+def test_depth_normals_and_mask_obey_the_contract(fine, view, scale):
     """Depth is finite exactly where NOT_HIT is unset; normals are unit there, face the camera, and are right in the median."""
-    gt, camera = sample.ground_truth[scale], view.rig.tof.scaled(scale)
+    gt, camera = fine.ground_truth[scale], view.rig.tof.scaled(scale)
     hit = (gt.mask & MaskBit.NOT_HIT) == 0
     np.testing.assert_array_equal(np.isfinite(gt.depth), hit)
     np.testing.assert_array_equal(np.isfinite(gt.normals).all(axis=-1), hit)
@@ -143,6 +156,37 @@ def test_scales_agree(sample, view):
     good = (one.mask & ~np.uint8(MaskBit.OUTSIDE)) == 0
     mean = two.depth.reshape(45, 2, 60, 2).mean(axis=(1, 3))
     assert np.nanpercentile(np.abs(mean - one.depth)[good], 95) < 0.001
+
+
+def test_four_times_agrees_with_the_exact_depth(fine, sample, view):
+    """At 4x the ray caster's own depth at 4x holds the classes to what 2x is held to; 1x and 2x stay what they are."""
+    world, T_base_flange = placed("box", 1)
+    T_base_tof = T_base_flange @ world.true_rig.T_flange_tof
+    exact = exact_view(world.caster()[0], world.constants.tof.scaled(4), T_base_tof)
+    truth, gt = replace(view.truth, depth=exact[0], normals=exact[1], target=exact[2]), fine.ground_truth[4]
+    for name in ("object", "table"):
+        error = class_errors(gt, truth)[name]
+        assert len(error.errors) > 2000
+        assert np.median(error.errors) <= 0.0002
+        assert np.percentile(error.errors, 99) <= 0.002
+        assert error.wrong <= 0.01
+        assert error.through == 0
+    good = gt.mask == 0
+    assert (good & truth.target).sum() > 0.25 * truth.target.sum()
+    assert np.median(np.einsum("nc,nc->n", gt.normals[good], truth.normals[good])) > np.cos(np.radians(3))
+    for scale in (1, 2):
+        for name in ("depth", "normals", "mask"):
+            a, b = (getattr(s.ground_truth[scale], name) for s in (fine, sample))
+            np.testing.assert_array_equal(a, b)
+
+
+def test_only_known_scales_are_made():
+    """1 and 2 are always there, and nothing but 4 comes beside them; only 4 is told in the digest."""
+    for scales in ((1, 4), (4, 2, 1), (1, 2, 3), ()):
+        with pytest.raises(ConfigError, match="scales"):
+            SampleConfig(scales=scales)
+    assert SampleConfig().table() == {"crop_radius": 0.35, "far": 2.0}
+    assert SampleConfig(scales=[1, 2, 4]).table()["scales"] == [1, 2, 4]
 
 
 def test_the_sample_carries_the_view(sample, view):
@@ -228,6 +272,23 @@ def test_build_check_and_read(recording, tmp_path):
     with ShardReader(out / "shards/box.h5") as shard:
         assert [shard.index(0), shard.index(1)] == [0, 2]
         assert shard.provenance["gt"]["p99_error_mm"] <= 3.0
+
+
+def test_four_times_on_demand(recording, tmp_path, capsys):
+    """`--scales 1 2 4` builds anew what was there without; it checks out, card and description tell, and the default goes back."""
+    out = tmp_path / "dataset"
+    command = ["build-dataset", str(recording), "--out", str(out), "--jobs", "1", "--json"]
+    before = build_dataset([recording], out, jobs=1)
+    for _ in range(2):
+        assert main([*command, "--scales", "1", "2", "4"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["skipped"] == ["box", "gear", "mug"]
+    assert check(out) == []
+    assert load_manifest(out).config["scales"] == [1, 2, 4]
+    assert "at 1x, 2x and 4x" in (out / "README.md").read_text()
+    with ShardReader(out / "shards/box.h5") as shard:
+        assert shard.ground_truth(1, 4).depth.shape == (180, 240)
+        assert shard.provenance["config"]["scales"] == [1, 2, 4]
+    assert build_dataset([recording], out, jobs=1).scenes == before.scenes
 
 
 @pytest.mark.parametrize("text", ["", "{}", None])

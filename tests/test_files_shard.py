@@ -137,7 +137,7 @@ def test_derived_arrays(tmp_path):
 def test_chunks_are_what_a_training_read_touches(tmp_path):
     """One frame of raw is one chunk, and every chunk carries a checksum."""
     path = tmp_path / "mug.h5"
-    write(path)
+    write(path, scales=(1, 2, 4))
     with h5py.File(path, "r") as file:
         assert file["tof/raw"].chunks == (1, 1, 8, 6, 8)
         assert file["gt/normals_2x"].chunks == (1, 12, 16, 3)

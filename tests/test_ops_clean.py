@@ -9,7 +9,17 @@ from hypothesis import strategies as st
 
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
-from tofcapture.ops.crop import LOWEST_SMOOTH, Crop, crop_depth, dominant_plane, find_crop, inside, lowered
+from tofcapture.ops.crop import (
+    FINEST,
+    LOWEST_SMOOTH,
+    SURE,
+    Crop,
+    crop_depth,
+    dominant_plane,
+    find_crop,
+    inside,
+    lowered,
+)
 from tofcapture.ops.denoise import SPIKE_PIXELS, SPIKE_SIGMAS, STEEPEST, SUPPORT, denoise
 from tofcapture.ops.register import register
 from tofcapture.poses import exp, transform_points
@@ -209,14 +219,15 @@ def test_a_crop_of_a_hundred_metres_is_none():
     assert inside(crop, points).all()
 
 
-@pytest.mark.parametrize("scatter", [0.0, 0.0001, 0.0002, 0.001])
+@pytest.mark.parametrize("scatter", [0.0, 0.000015, 0.00002, 0.0001, 0.0002, 0.001])
 def test_smoothed_points_lower_the_crop_to_their_own_scatter(scatter):
-    """Four standard deviations of the table, never less than a quarter of a millimetre, never more than before."""
+    """Four standard deviations of the table, at least a quarter of a millimetre or twelve of them, never more than before."""
     points = np.random.default_rng(0).normal(0, 1, (4000, 3)) * [0.1, 0.1, scatter] + [0, 0, 1]
     points[:800, 2] -= 0.05  # an object
     crop = Crop(np.array([0, 0, -1.0]), -1.0, np.array([0, 0, 1.0]), 0.35, 0.0012, 2.0)
     low = lowered(crop, points).clearance
-    assert low == pytest.approx(min(0.0012, max(LOWEST_SMOOTH, 4 * scatter)), rel=0.1)
+    least = min(LOWEST_SMOOTH, max(FINEST, SURE * scatter))
+    assert low == pytest.approx(min(0.0012, max(least, 4 * scatter)), rel=0.1)
     assert lowered(crop, points[:300]) == crop  # too few to tell
     assert not np.isfinite(lowered(find_crop(points, UP, rng(), 1e3), points).offset)
 

@@ -151,6 +151,36 @@ def test_small_holes_are_filled_and_large_ones_are_not():
     assert np.isnan(found.depth).sum() > np.isnan(whole.depth).sum()
 
 
+@pytest.mark.parametrize("rise", [0.05, 0.08, 0.11])
+def test_a_step_that_hides_in_a_small_hole_is_marked(rise):
+    """Of two walls whose border was lost, pixels with depth between them carry the edge mark; those on a wall need none."""
+    camera = TOF.scaled(4)
+    walls = [(1.0 - rise, -0.3, 0.0, -9, 9), BACK]
+    depth = planes(STEREO, np.eye(4), walls)
+    step = np.flatnonzero(np.diff(depth[0]) > 0.04)[0]
+    depth[:, step : step + 3] = np.nan
+    sheet = triangulate(depth, STEREO)
+    found = project(sheet, STEREO, T, camera, edge_pixels=1)
+    z = transform_points(invert(T), camera.unproject(found.depth))[..., 2]
+    between = np.minimum(np.abs(z - 1.0), np.abs(z - (1.0 - rise))) > 1e-6  # NaN compares false
+    assert sheet.doubtful[:, step : step + 3].all()
+    assert sheet.doubtful.sum() == 3 * STEREO.height
+    assert between.any()
+    assert found.edge[between].all()
+    columns = found.pixels[..., 0]
+    beside = (np.abs(columns - step) < 10) & ~between & ~found.occluded
+    assert not found.edge[beside & (np.abs(found.pixels[..., 1] - STEREO.height / 2) < 40)].all()
+
+
+def test_a_hole_in_a_steep_plane_is_no_doubt():
+    """Three lost pixels of a plane whose depth changes less across them than between neighbours at most are surface."""
+    depth = 1.0 / (1 - 0.5 * STEREO.rays[..., 0])
+    whole = render(depth)
+    depth[50, 60:63] = np.nan
+    assert not triangulate(depth, STEREO).doubtful.any()
+    np.testing.assert_array_equal(render(depth).edge, whole.edge)
+
+
 def test_the_back_of_a_sheet_is_no_surface():
     """A camera behind the wall sees nothing of it."""
     depth = planes(STEREO, np.eye(4), [BACK])

@@ -15,7 +15,7 @@ Bool = NDArray[np.bool_]
 def bridge(z: Float64, vertex: Bool, doubtful: Bool, steepest: float, filled_gap: int) -> None:
     """Fill holes of rows linearly in inverse depth, in place; small fills of a smooth surface become vertices.
 
-    Those are ``doubtful`` where the hole is wide enough to hide a step that would have been cut between neighbours.
+    Those are ``doubtful`` (start with False) where a step may hide that would have been cut between neighbours.
     """
     height, width = z.shape
     for v in range(height):
@@ -23,7 +23,6 @@ def bridge(z: Float64, vertex: Bool, doubtful: Bool, steepest: float, filled_gap
         for b in range(width):
             zb = z[v, b]
             vertex[v, b] = np.isfinite(zb)
-            doubtful[v, b] = False
             if not vertex[v, b]:
                 continue
             if last >= 0 and b - last > 1:
@@ -207,10 +206,10 @@ def invented(doubtful: Bool, pixels: Float64, mark: Bool) -> None:
     rows, columns = doubtful.shape
     for pv in range(mark.shape[0]):
         for pu in range(mark.shape[1]):
-            if np.isfinite(pixels[pv, pu, 0]):
+            if not mark[pv, pu] and np.isfinite(pixels[pv, pu, 0]):
                 u, v = min(int(pixels[pv, pu, 0]), columns - 2), min(int(pixels[pv, pu, 1]), rows - 2)
                 above = doubtful[v, u] or doubtful[v, u + 1]
-                mark[pv, pu] |= above or doubtful[v + 1, u] or doubtful[v + 1, u + 1]
+                mark[pv, pu] = above or doubtful[v + 1, u] or doubtful[v + 1, u + 1]
 
 
 @compiled

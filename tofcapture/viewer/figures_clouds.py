@@ -1,0 +1,149 @@
+"""Clouds as pictures: points are splatted from far to near and darkened where they lie behind their neighbours.
+
+Pictures of a fixed size keep PDF and SVG small, whatever the number of points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.poses import Float64, transform_points
+
+UInt8 = NDArray[np.uint8]
+AZIMUTH, ELEVATION = (
+    np.radians(40.0),
+    np.radians(20.0),
+)  # from where clouds are seen: beside the camera, above the table
+_SHADE = 60.0  # how dark a step of depth makes a point, per unit of the picture's extent
+_MARGIN = 0.06  # of the extent
+
+
+@dataclass(frozen=True)
+class Stage:
+    """From where clouds are seen, orthographically.
+
+    Attributes
+    ----------
+    T_eye_tof
+        (4, 4) ToF frame to the eye's: x right, y down, z away.
+    low, high
+        (2,) x and y in the eye's frame at the picture's top left and bottom right corners, metres.
+    """
+
+    T_eye_tof: Float64
+    low: Float64
+    high: Float64
+
+    @property
+    def aspect(self) -> float:
+        """Width over height."""
+        width, height = self.high - self.low
+        return float(width / height)
+
+
+def stage_for(points: Float64, T_base_tof: Float64, aspect: float = 4 / 3) -> Stage:
+    """Look at a cloud from the camera's left and from above, the table level.
+
+    Parameters
+    ----------
+    points
+        (N, 3) what must be in the picture, but for 0.5 percent at each side; ToF frame, metres.
+    T_base_tof
+        (4, 4); z of the base is up.
+    aspect
+        Width over height of the picture.
+    """
+    T = np.eye(4)
+    T[:3, :3] = _looking(T_base_tof[:3, 2]) @ T_base_tof[:3, :3]
+    seen = transform_points(T, points)[:, :2] if len(points) else np.zeros((1, 2))
+    low, high = np.percentile(seen, (0.5, 99.5), axis=0)
+    extent = np.maximum((high - low) * (1 + 2 * _MARGIN), 0.01)
+    extent = np.array([max(extent[0], aspect * extent[1]), max(extent[1], extent[0] / aspect)])
+    middle = (low + high) / 2
+    return Stage(T, middle - extent / 2, middle + extent / 2)
+
+
+def _looking(axis: Float64) -> Float64:
+    """Rotation (3, 3) from the base to an eye whose heading is the camera's, turned by the azimuth."""
+    heading = np.arctan2(axis[1], axis[0]) + AZIMUTH
+    away = np.array(
+        [
+            np.cos(heading) * np.cos(ELEVATION),
+            np.sin(heading) * np.cos(ELEVATION),
+            -np.sin(ELEVATION),
+        ]
+    )
+    right = np.array([np.sin(heading), -np.cos(heading), 0.0])
+    return np.stack([right, np.cross(away, right), away])
+
+
+def splat(
+    clouds: Sequence[tuple[NDArray[Any], tuple[int, int, int]]], stage: Stage, width: int = 480, size: int = 2
+) -> UInt8:
+    """Draw clouds on white.
+
+    Parameters
+    ----------
+    clouds
+        Points (N, 3) in the ToF frame, metres, NaN allowed, and the colour of each cloud.
+    stage
+        From where.
+    width
+        Of the picture, pixels.
+    size
+        Edge of a point, pixels.
+
+    Returns
+    -------
+    (H, W, 3) uint8.
+    """
+    height = round(width / stage.aspect)
+    index, depth, colours = _gathered(clouds, stage, width, height, size)
+    order = np.argsort(-depth, kind="stable")  # the nearest is written last
+    nearest = np.full(width * height, np.inf)
+    nearest[index[order]] = depth[order]
+    image = np.full((width * height, 3), 255.0)
+    image[index[order]] = colours[order]
+    scale = 1 / float(np.max(stage.high - stage.low))
+    shade = _shade(nearest.reshape(height, width) * scale)
+    return np.rint(image.reshape(height, width, 3) * shade[..., None]).astype(np.uint8)
+
+
+def _gathered(
+    clouds: Sequence[tuple[NDArray[Any], tuple[int, int, int]]],
+    stage: Stage,
+    width: int,
+    height: int,
+    size: int,
+) -> tuple[NDArray[np.intp], Float64, Float64]:
+    """Pixels (M,), depths (M,) and colours (M, 3) of everything that is in the picture."""
+    found: list[tuple[Any, Any, Any]] = [(np.zeros(0, np.intp), np.zeros(0), np.zeros((0, 3)))]
+    for points, colour in clouds:
+        flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        eye = transform_points(stage.T_eye_tof, flat[np.isfinite(flat).all(axis=1)])
+        at = np.floor((eye[:, :2] - stage.low) / (stage.high - stage.low) * [width, height]).astype(np.intp)
+        for dy, dx in np.ndindex(size, size):
+            x, y = at[:, 0] + dx, at[:, 1] + dy
+            keep = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            found.append(((y * width + x)[keep], eye[keep, 2], np.broadcast_to(colour, (keep.sum(), 3))))
+    index, depth, colours = (np.concatenate(part) for part in zip(*found, strict=True))
+    return index, depth, colours
+
+
+def _shade(depth: Float64) -> Float64:
+    """Eye-dome lighting (Boucheny 2009): 1 where no neighbour is nearer, less behind a step."""
+    padded = np.pad(depth, 2, constant_values=np.inf)
+    height, width = depth.shape
+    behind = np.zeros(depth.shape)
+    there = np.isfinite(depth)
+    for dy, dx in ((-2, 0), (2, 0), (0, -2), (0, 2)):
+        other = padded[2 + dy : 2 + dy + height, 2 + dx : 2 + dx + width]
+        both = there & np.isfinite(other)
+        behind[both] += np.clip(depth[both] - other[both], 0, 0.02)
+    out: Float64 = np.exp(-_SHADE * behind / 4)
+    return out
