@@ -209,7 +209,7 @@ def test_bfloat16_trains_and_keeps_geometry_in_float32(dataset, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("kind", ["onnx", "torch"])
+@pytest.mark.parametrize("kind", ["onnx", pytest.param("torch", marks=pytest.mark.slow)])
 def test_an_export_answers_as_torch_does(dataset, runs, tmp_path, kind):
     """The export is checked on two batch sizes, and predict's onnx backend gives the same depth."""
     if kind == "onnx":
