@@ -1,9 +1,10 @@
 """What 200 event streams and 50 requests a second cost a recording: its cadence with and without them, in turns.
 
-    python benchmarks/daemon_load.py
+    python benchmarks/daemon_load.py [--replay RECORDING --scene NAME --views 25 --repeats 3]
 
-The station is one of arrays at full size whose devices take their time, as a replayed recording's do. Load is switched on and
-off every few views of one recording, so that both halves see the same machine. Medians of the time from view to view.
+The station is one of arrays at full size whose devices take their time (``--delay``), or a recording that is replayed as fast as it can
+be read. Load is switched on and off every few views of one recording, so that both halves see the same machine. Medians of the
+time from view to view.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from typing import Any
 
 import aiohttp
 
+from tofcapture.devices.replay_station import write_station
 from tofcapture.record.daemon.client import ask
 
 STATION = Path(__file__).with_name("daemon_station.py")
@@ -67,18 +69,32 @@ def _cpu(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _measure(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+def _daemon(folder: Path, args: argparse.Namespace) -> tuple[subprocess.Popen[str], str, str]:
+    """Start a daemon; with it, its address and its token."""
     env = {**os.environ, "BENCH_DELAY": str(args.delay), "BENCH_LARGE": "1", "OMP_NUM_THREADS": "1"}
-    state = folder / "st"
-    command = [sys.executable, STATION, "daemon", folder / "root", state, "--http", "127.0.0.1:0"]
-    daemon = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env)
+    command = [sys.executable, STATION, "daemon", folder / "root", folder / "st"]
+    if args.replay:
+        station = write_station(args.replay, folder / "replayed")
+        command = [sys.executable, "-m", "tofcapture", "daemon", "--root", folder / "root"]
+        command += ["--state", folder / "st", "--station", station]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    daemon = subprocess.Popen([*command, "--http", "127.0.0.1:0"], text=True, env=env, **pipes)
     assert daemon.stdout is not None
-    url, _, token = daemon.stdout.readline().strip().partition("/#token=")
+    for line in daemon.stdout:
+        if "/#token=" in line:
+            url, _, token = line.strip().removeprefix("listening on ").partition("/#token=")
+            return daemon, url, token
+    raise SystemExit("the daemon ended before it said where it listens")
+
+
+def _measure(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+    state = folder / "st"
+    daemon, url, token = _daemon(folder, args)
     load: subprocess.Popen[str] | None = None
     spans: dict[str, list[float]] = {"calm": [], "load": []}
     told: list[dict[str, int]] = []
     try:
-        wish = {"scene": "mug", "recording": "r", "views": args.views, "frames": 10}
+        wish = {"scene": args.scene, "recording": "r", "views": args.views, "frames": 10}
         ask("POST", "/v1/jobs", wish, state)
         seen, last, mode, begun = 0, 0.0, "calm", 0
         while True:
@@ -101,16 +117,21 @@ def _measure(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
             _switch(load, url, token, args, told)
         daemon.terminate()
         daemon.wait(10)
-    calm, loaded = (statistics.median(spans[m]) for m in ("calm", "load"))
+    return {"spans": spans, "daemon_cpu_s": round(cpu, 2), "load": told}
+
+
+def _summary(runs: list[dict[str, Any]], args: argparse.Namespace) -> dict[str, Any]:
+    spans = {mode: [span for run in runs for span in run["spans"][mode]] for mode in ("calm", "load")}
+    calm, loaded = (statistics.median(spans[mode]) for mode in ("calm", "load"))
     return {
         "streams": args.streams,
         "requests_per_s": args.rate,
-        "views": {m: len(s) for m, s in spans.items()},
+        "views": {mode: len(found) for mode, found in spans.items()},
         "calm_s": round(calm, 4),
         "load_s": round(loaded, 4),
         "ratio": round(loaded / calm, 4),
-        "daemon_cpu_s": round(cpu, 2),
-        "load": told,
+        "daemon_cpu_s": [run["daemon_cpu_s"] for run in runs],
+        "load": [told for run in runs for told in run["load"]],
     }
 
 
@@ -141,13 +162,19 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=60)
     parser.add_argument("--block", type=int, default=8, help="views between switches of the load")
     parser.add_argument("--delay", type=float, default=0.5, help="seconds that each device step takes")
+    parser.add_argument("--replay", type=Path, metavar="RECORDING", help="replay it instead")
+    parser.add_argument("--scene", default="mug")
+    parser.add_argument("--repeats", type=int, default=1, help="recordings, one after the other")
     parser.add_argument("--load", metavar="URL", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.load:
         asyncio.run(_load(args.load, os.environ["LOAD_TOKEN"], args.streams, args.rate))
         return
-    with tempfile.TemporaryDirectory(prefix="load-") as name:
-        print(json.dumps(_measure(Path(name), args)))
+    runs = []
+    for _ in range(args.repeats):
+        with tempfile.TemporaryDirectory(prefix="load-") as name:
+            runs.append(_measure(Path(name), args))
+    print(json.dumps(_summary(runs, args)))
 
 
 if __name__ == "__main__":

@@ -15,11 +15,7 @@ from tofcapture.camera import Camera
 from tofcapture.command import Outcome
 from tofcapture.errors import DataError
 from tofcapture.poses import Float64, invert, transform, transform_points
-
-TILT_BINS = (0.0, 8.0, 15.0, 25.0, 40.0, 90.0)  # deg
-SECTORS = ("right", "lower right", "below", "lower left", "left", "upper left", "above", "upper right")
-GRID = (9, 12)  # cells of the image, rows and columns
-TILTED = 8.0  # deg; a board less tilted leans in no direction
+from tofcapture.record.board_meter import CELLS, SECTORS, TILTED, TILTS
 
 
 def coverage(poses: Sequence[Float64], camera: Camera, outline: Float64) -> dict[str, Any]:
@@ -41,7 +37,7 @@ def coverage(poses: Sequence[Float64], camera: Camera, outline: Float64) -> dict
         ``sectors`` (counts by the direction in which the front leans in the image); ``image`` (9 x 12 counts), ``image_share``;
         ``missing`` (what to record next, in words; empty when nothing is).
     """
-    tilts, leans, distances, grid = [], [], [], np.zeros(GRID, dtype=int)
+    tilts, leans, distances, grid = [], [], [], np.zeros(CELLS, dtype=int)
     outlines = np.broadcast_to(outline, (len(poses), *np.shape(outline)[-2:]))
     for T, shape in zip(poses, outlines, strict=True):
         tilt, lean = _tilt(T)
@@ -57,8 +53,8 @@ def coverage(poses: Sequence[Float64], camera: Camera, outline: Float64) -> dict
         "tilt_deg": tilts,
         "lean_deg": [_tilt(T)[1] for T in poses],
         "distance_m": distances,
-        "tilt_edges_deg": list(TILT_BINS),
-        "tilt_histogram": np.histogram(tilts, TILT_BINS)[0].tolist(),
+        "tilt_edges_deg": list(TILTS),
+        "tilt_histogram": np.histogram(tilts, TILTS)[0].tolist(),
         "sectors": sectors,
         "image": grid.tolist(),
         "image_share": float((grid > 0).mean()),
@@ -80,9 +76,9 @@ def _seen(T_tof_board: Float64, camera: Camera, outline: Float64) -> Any:
     corners = np.column_stack([outline, np.zeros(len(outline))])
     pixels, depth = camera.project(transform_points(T_tof_board, corners))
     if not (depth > 0).all():
-        return np.zeros(GRID, dtype=int)
-    v = (np.arange(GRID[0]) + 0.5) * camera.height / GRID[0] - 0.5
-    u = (np.arange(GRID[1]) + 0.5) * camera.width / GRID[1] - 0.5
+        return np.zeros(CELLS, dtype=int)
+    v = (np.arange(CELLS[0]) + 0.5) * camera.height / CELLS[0] - 0.5
+    u = (np.arange(CELLS[1]) + 0.5) * camera.width / CELLS[1] - 0.5
     return inside(pixels, np.stack(np.meshgrid(u, v), axis=-1)).astype(int)
 
 
@@ -107,7 +103,7 @@ def _missing(found: dict[str, Any], grid: Any) -> list[str]:
 
 def _emptiest(grid: Any) -> str:
     """Name the quarter of the image that the board has covered least."""
-    rows, columns = GRID[0] // 2, GRID[1] // 2
+    rows, columns = CELLS[0] // 2, CELLS[1] // 2
     quarters = {
         "upper left": grid[:rows, :columns],
         "upper right": grid[:rows, columns:],
@@ -128,8 +124,8 @@ def recorded_poses(recording: Path) -> tuple[list[Float64], Camera]:
         No views, or a recording without a station.
     """
     from calibration.pairs import calibration_views
+    from tofcapture.devices.clearance import stage_of
     from tofcapture.files.view import read_view
-    from tofcapture.record.clearance import stage_of
 
     stage = stage_of(_station(recording))
     T_base_board = _facing(stage.board, stage.board_normal)

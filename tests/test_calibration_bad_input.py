@@ -11,30 +11,19 @@ import pytest
 
 from calibration.align_diagnosis import check_start, unusable
 from calibration.solve import align
+from tests.stations import HALF_SIZE_CAMERAS
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, QualityError
 from tofcapture.files.view import read_view, view_path, write_view
 from tofcapture.poses import invert, transform
 
 VIEWS = 4
-SMALL = """
-[sim.tof]
-width = 120
-height = 90
-fx = 95.3
-fy = 100.4
-cx = 57.9
-cy = 50.2
-[sim.stereo]
-width = 640
-height = 512
-fx = 577.5
-fy = 577.5
-cx = 319.5
-cy = 255.5
-[sim.render]
+SMALL = (
+    HALF_SIZE_CAMERAS
+    + """[sim.render]
 multipath = false
 """
+)
 
 
 @pytest.fixture(scope="module")

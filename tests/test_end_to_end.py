@@ -7,29 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.stations import HALF_SIZE_CAMERAS
 from tofcapture.cli import main
 
-SMALL_CAMERAS = """
-[sim.tof]
-width = 120
-height = 90
-fx = 95.3
-fy = 100.4
-cx = 57.9
-cy = 50.2
-[sim.stereo]
-width = 640
-height = 512
-fx = 577.5
-fy = 577.5
-cx = 319.5
-cy = 255.5
-[sim.render]
+SMALL_CAMERAS = (
+    HALF_SIZE_CAMERAS
+    + """[sim.render]
 patches = 400
 patch_rays = 64
 rays = 16
 subpixels = 3
 """
+)
 
 
 @pytest.fixture(scope="module")

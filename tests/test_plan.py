@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tofcapture.camera import Camera
+from tofcapture.devices.clearance import is_clear, obstacles, route, stage_of
 from tofcapture.devices.kinematics import HOME, MODELS, forward
 from tofcapture.devices.station import read_station
 from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.poses import rotation_exp, transform
-from tofcapture.record.clearance import is_clear, obstacles, route, stage_of
 from tofcapture.record.plan import board_sampling, object_sampling, plan_views
 from tofcapture.rig import Rig
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from tofcapture.camera import Camera
+from tofcapture.devices.clearance import stage_of
 from tofcapture.devices.kinematics import MODELS
 from tofcapture.devices.station import read_station
 from tofcapture.poses import look_at, rotation_exp, transform
 from tofcapture.record.board_meter import SECTORS, lean_of, meter
-from tofcapture.record.clearance import stage_of
 from tofcapture.record.plan import board_sampling, plan_views
 from tofcapture.rig import Rig
 

@@ -6,8 +6,9 @@ import time
 import numpy as np
 import pytest
 
+from tests.emulated import THERE, at_home, station_file
 from tofcapture.devices import faults
-from tofcapture.devices.kinematics import HOME, MODELS, forward
+from tofcapture.devices.kinematics import MODELS, forward
 from tofcapture.devices.registry import StationContext, make_device
 from tofcapture.devices.station import open_station
 from tofcapture.errors import ConfigError, MotionRefused
@@ -16,12 +17,8 @@ from tofcapture.record import recorder
 from tofcapture.record.recorder import record
 from tofcapture.record.scene_plan import plan_scene
 from tofcapture.testing import check_arm
-from tofcapture.testing.stations import ur_station
-from tofcapture.testing.ur_emulator.process import Emulator
 
 pytest.importorskip("rtde_control", reason="the ur_rtde library is not installed")
-
-THERE = HOME - [1.2, 0, 0, 0, 0, 0]
 
 
 def _turned(joint, angle):
@@ -30,35 +27,10 @@ def _turned(joint, angle):
     return goal
 
 
-@pytest.fixture(scope="module")
-def running():
-    with Emulator() as emulator:
-        yield emulator
-
-
-@pytest.fixture
-def emulator(running):
-    """The emulator at rest, without faults."""
-    running.calm()
-    return running
-
-
-def _station(tmp_path, emulator, more=""):
-    file = tmp_path / "station.toml"
-    file.write_text(ur_station(emulator.host, more))
-    return file
-
-
-def _at_home(arm):
-    """Wherever an earlier test left the arm, it begins at home."""
-    if np.abs(arm.state().joints - HOME).max() > 1e-3:
-        arm.move_to(HOME)
-
-
 def test_moves_measures_and_refuses(emulator, tmp_path):
     """It goes where it is told, reports the controller's pose, and refuses bad goals without moving."""
-    with open_station(_station(tmp_path, emulator), allow_motion=True) as station:
-        _at_home(station.arm)
+    with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
+        at_home(station.arm)
         state = station.arm.move_to(THERE)
         np.testing.assert_allclose(state.joints, THERE, atol=4e-4)
         np.testing.assert_allclose(state.T_base_flange, forward(MODELS["ur10e"], state.joints), atol=1e-9)
@@ -75,7 +47,7 @@ def test_moves_measures_and_refuses(emulator, tmp_path):
 
 def test_nothing_moves_without_consent(emulator, tmp_path):
     """A station opened without allow_motion reads the arm and refuses to move it; so does the driver itself."""
-    file = _station(tmp_path, emulator)
+    file = station_file(tmp_path, emulator)
     with open_station(file) as station:
         before = station.arm.state().joints
         with pytest.raises(MotionRefused, match="not allowed"):
@@ -92,7 +64,7 @@ def test_nothing_moves_without_consent(emulator, tmp_path):
 
 def test_another_model_is_refused(emulator, tmp_path):
     """A station file that names another arm than the controller drives is refused at opening."""
-    file = _station(tmp_path, emulator, 'model = "ur5e"')
+    file = station_file(tmp_path, emulator, 'model = "ur5e"')
     with pytest.raises(ConfigError, match="ur5e"), open_station(file):
         pass
     assert emulator.order("status")["runtime"] == 1
@@ -112,7 +84,7 @@ def _planned_once():
 def test_recording_completes_after_a_protective_stop(emulator, tmp_path, monkeypatch):
     """A protective stop in mid-move ends the run by its name; nothing unlocks it; after a person did, the run completes."""
     monkeypatch.setattr(recorder, "plan_scene", _planned_once())
-    file, recording = _station(tmp_path, emulator), tmp_path / "recording"
+    file, recording = station_file(tmp_path, emulator), tmp_path / "recording"
     emulator.order("protective_stop", share=0.5)
     with open_station(file, allow_motion=True) as station:
         result = record(station, "mug", recording, views=1, frames=1)
@@ -134,7 +106,7 @@ def test_recording_completes_after_a_protective_stop(emulator, tmp_path, monkeyp
 def test_slow_controller_is_waited_for(emulator, tmp_path):
     """A speed slider at 30 % and late answers are no faults."""
     emulator.order("slow", speed=0.3, delay=0.05)
-    with open_station(_station(tmp_path, emulator), allow_motion=True) as station:
+    with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
         state = station.arm.move_to(station.arm.state().joints + 0.1)
         assert np.isfinite(state.joints).all()
 
@@ -143,7 +115,7 @@ def test_slow_controller_is_waited_for(emulator, tmp_path):
 def test_older_controllers_do(emulator, tmp_path):
     """A controller without the outputs that came later is asked in other ways, and moves."""
     emulator.order("lack", names=["tcp_offset", "payload", "speed_scaling"])
-    with open_station(_station(tmp_path, emulator), allow_motion=True) as station:
+    with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
         goal = station.arm.state().joints + 0.05
         np.testing.assert_allclose(station.arm.move_to(goal).joints, goal, atol=4e-4)
 
@@ -151,7 +123,7 @@ def test_older_controllers_do(emulator, tmp_path):
 @pytest.mark.slow
 def test_a_whole_scene(emulator, tmp_path):
     """A plan of 25 views completes, each at its planned joints."""
-    with open_station(_station(tmp_path, emulator), allow_motion=True) as station:
+    with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
         result = record(station, "mug", tmp_path / "recording", views=25, frames=1)
     assert len(result.recorded) == len(result.plan.views) == 25
     assert json.dumps(result.plan.table())
@@ -160,7 +132,7 @@ def test_a_whole_scene(emulator, tmp_path):
 @pytest.mark.slow
 def test_keeps_the_contract(emulator, tmp_path):
     """The driver passes the suite that any driver can be put through."""
-    with open_station(_station(tmp_path, emulator)) as station:
+    with open_station(station_file(tmp_path, emulator)) as station:
         rig, config = station.rig, station.config
     context = StationContext(config, tmp_path, allow_motion=True)
     check_arm(lambda: make_device("arm", context), prepare=lambda arm: arm.equip(rig))

@@ -10,41 +10,13 @@ import time
 import numpy as np
 import pytest
 
+from tests.emulated import THERE, at_home, station_file
 from tofcapture.devices import faults
-from tofcapture.devices.kinematics import HOME
 from tofcapture.devices.station import open_station
-from tofcapture.testing.stations import ur_station
-from tofcapture.testing.ur_emulator.process import Emulator
 
 pytest.importorskip("rtde_control", reason="the ur_rtde library is not installed")
 
 LIMIT = 15.0  # s within which a fault has its name
-THERE = HOME - [1.2, 0, 0, 0, 0, 0]
-
-
-@pytest.fixture(scope="module")
-def running():
-    with Emulator() as emulator:
-        yield emulator
-
-
-@pytest.fixture
-def emulator(running):
-    """The emulator at rest, without faults."""
-    running.calm()
-    return running
-
-
-def _station(tmp_path, emulator, more=""):
-    file = tmp_path / "station.toml"
-    file.write_text(ur_station(emulator.host, more))
-    return file
-
-
-def _at_home(arm):
-    """Wherever an earlier test left the arm, it begins at home."""
-    if np.abs(arm.state().joints - HOME).max() > 1e-3:
-        arm.move_to(HOME)
 
 
 MOVING = {
@@ -58,8 +30,8 @@ MOVING = {
 
 
 def _fault_in_motion(emulator, tmp_path, order):
-    with open_station(_station(tmp_path, emulator), allow_motion=True) as station:
-        _at_home(station.arm)
+    with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
+        at_home(station.arm)
         emulator.order(order, share=0.3)
         start = time.monotonic()
         with pytest.raises(MOVING[order]) as caught:
@@ -96,7 +68,7 @@ def _read_on(arm):
 @pytest.mark.parametrize("order", list(MOVING))
 def test_faults_at_rest(emulator, tmp_path, order):
     """A fault while the arm stands is noticed by the next call."""
-    with open_station(_station(tmp_path, emulator), allow_motion=True) as station:
+    with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
         emulator.order(order)
         start = time.monotonic()
         with pytest.raises(MOVING[order]):
@@ -114,7 +86,7 @@ def test_the_library_is_never_waited_for(emulator, tmp_path, stage, skip):
     """A controller that falls silent once the library talks to it is named silent in time, though the library hangs."""
     emulator.order("mute", stage=stage, skip=skip)
     start = time.monotonic()
-    with pytest.raises(faults.ControllerSilent), open_station(_station(tmp_path, emulator)):
+    with pytest.raises(faults.ControllerSilent), open_station(station_file(tmp_path, emulator)):
         pass
     assert time.monotonic() - start < LIMIT
 
@@ -124,7 +96,7 @@ def test_dead_script(emulator, tmp_path):
     """A controller that never starts the script is named so in time."""
     emulator.order("mute", stage="script")
     start = time.monotonic()
-    with pytest.raises(faults.ProgramStopped), open_station(_station(tmp_path, emulator)):
+    with pytest.raises(faults.ProgramStopped), open_station(station_file(tmp_path, emulator)):
         pass
     assert time.monotonic() - start < LIMIT
 
@@ -132,8 +104,8 @@ def test_dead_script(emulator, tmp_path):
 @pytest.mark.slow
 def test_killed_driver(emulator, tmp_path):
     """SIGKILL of the driver's process in mid-move is named, and the controller's watchdog stops the arm on its way."""
-    with open_station(_station(tmp_path, emulator), allow_motion=True) as station:
-        _at_home(station.arm)
+    with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
+        at_home(station.arm)
         timer = threading.Timer(0.5, os.kill, (station.arm.pid, signal.SIGKILL))
         timer.start()
         with pytest.raises(faults.HostLost, match="exit status -9"):
@@ -145,9 +117,9 @@ def test_killed_driver(emulator, tmp_path):
 @pytest.mark.slow
 def test_killed_station(emulator, tmp_path):
     """SIGKILL of the station's process in mid-move stops the arm on its way; the next run goes on."""
-    file = _station(tmp_path, emulator)
+    file = station_file(tmp_path, emulator)
     with open_station(file, allow_motion=True) as station:
-        _at_home(station.arm)
+        at_home(station.arm)
     program = (
         "import sys; from pathlib import Path; from tofcapture.devices.station import open_station\n"
         f"with open_station(Path({str(file)!r}), allow_motion=True) as s: s.arm.move_to({THERE.tolist()})"
@@ -160,4 +132,4 @@ def test_killed_station(emulator, tmp_path):
     child.wait()
     assert np.abs(np.array(emulator.rest(3)["joints"]) - THERE).max() > 1e-3
     with open_station(file, allow_motion=True) as station:
-        _at_home(station.arm)
+        at_home(station.arm)

@@ -13,9 +13,9 @@ from tofcapture.errors import TofError
 
 def look_at_station(path: str, opening: str = "") -> list[Finding]:
     """A station: its file, its drivers, and whether its devices answer; with ``opening`` they are opened too."""
+    from tofcapture.devices.clearance import stage_of
     from tofcapture.devices.registry import ROLES, StationContext
     from tofcapture.devices.station import open_station, read_station
-    from tofcapture.record.clearance import stage_of
 
     file = Path(path) if path else None
     try:

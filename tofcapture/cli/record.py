@@ -102,9 +102,9 @@ def _metered(
     progress: Callable[[int, int], None], station: Station, recording: Path, plan: Plan
 ) -> Callable[[int, int], None]:
     """Print what the board views cover after each one."""
+    from tofcapture.devices.clearance import stage_of
     from tofcapture.devices.sim.scenes import CALIBRATION
     from tofcapture.record.board_meter import meter, taken
-    from tofcapture.record.clearance import stage_of
 
     stage, rig, said = stage_of(station.config), station.rig, [-1]
 
@@ -146,8 +146,8 @@ def _handed_over(args: argparse.Namespace, scene: str, views: int) -> Outcome | 
 
 def _planned(args: argparse.Namespace, scene: str, station: Station, plan: Plan) -> Outcome:
     """Print the plan, draw it."""
+    from tofcapture.devices.clearance import stage_of
     from tofcapture.files.seal import write_text
-    from tofcapture.record.clearance import stage_of
     from tofcapture.record.picture import plan_svg
 
     stage = stage_of(station.config)

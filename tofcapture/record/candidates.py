@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.devices.clearance import REASONS, Stage, obstacles
 from tofcapture.devices.kinematics import ArmModel, inverse_all, wrap
 from tofcapture.poses import Float64, invert, look_at, rotate_vectors
-from tofcapture.record.clearance import REASONS, Stage, obstacles
 from tofcapture.rig import Rig
 
 Bools = NDArray[np.bool_]

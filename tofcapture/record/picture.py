@@ -8,8 +8,8 @@ from html import escape
 import numpy as np
 
 from tofcapture.camera import Camera
+from tofcapture.devices.clearance import Stage
 from tofcapture.poses import Float64, transform_points
-from tofcapture.record.clearance import Stage
 from tofcapture.record.plan import FATES, REMEDIES, Plan, PlannedView
 from tofcapture.rig import Rig
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.devices.clearance import Stage, is_clear
 from tofcapture.devices.kinematics import ArmModel, forward
 from tofcapture.poses import Float64, rotate_vectors
 from tofcapture.record.candidates import (
@@ -32,7 +33,6 @@ from tofcapture.record.candidates import (
     leans,
     object_sampling,
 )
-from tofcapture.record.clearance import Stage, is_clear
 from tofcapture.rig import Rig
 
 __all__ = [

@@ -6,12 +6,12 @@ import hashlib
 
 import numpy as np
 
+from tofcapture.devices.clearance import stage_of
 from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.sim.scenes import CALIBRATION
 from tofcapture.devices.station import Station
 from tofcapture.errors import ConfigError
 from tofcapture.files.view import check_scene_name
-from tofcapture.record.clearance import stage_of
 from tofcapture.record.plan import Plan, board_sampling, object_sampling, plan_views
 
 

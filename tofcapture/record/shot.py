@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from tofcapture import __version__
+from tofcapture.devices.clearance import route, stage_of
 from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.station import Station
 from tofcapture.errors import DeviceError
 from tofcapture.frames import ArmState, View
-from tofcapture.record.clearance import route, stage_of
 from tofcapture.record.journal import utc_now
 from tofcapture.record.plan import Plan, PlannedView
 from tofcapture.record.quality import REFUSE, RETAKE, judge, measure, record_of, sentence

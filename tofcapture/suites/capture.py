@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from tofcapture import __version__
+from tofcapture.devices.clearance import stage_of
 from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.sim import VERSION
@@ -23,7 +24,6 @@ from tofcapture.files.seal import sealed_digest
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, View
 from tofcapture.poses import invert
-from tofcapture.record.clearance import stage_of
 from tofcapture.record.plan import object_sampling, plan_views
 from tofcapture.suites.recipe import Scene
 

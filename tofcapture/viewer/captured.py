@@ -41,7 +41,7 @@ def recording_source(recording: Path) -> Source:
         )
     aligned = recording / "rig.toml"
     rig = load_rig(aligned) if aligned.exists() else read_view(paths[0]).rig
-    arm = _arm_of(recording)
+    arm = arm_of(recording)
     names = [f"{p.parent.name} {int(p.stem.removeprefix('view-'))}" for p in paths]
     return Source(
         f"recording {recording.resolve().name}",
@@ -59,12 +59,13 @@ def view_source(path: Path) -> Source:
     return Source(
         f"view {path.name}",
         [f"{view.scene} {view.index}"],
-        lambda _: view_shot(view, rig, _arm_of(folder)),
+        lambda _: view_shot(view, rig, arm_of(folder)),
         rig,
     )
 
 
-def _arm_of(recording: Path) -> ArmModel | None:
+def arm_of(recording: Path) -> ArmModel | None:
+    """Arm that ``station.toml`` names; ``None`` where it names none that is known."""
     try:
         table = tomllib.loads((recording / "station.toml").read_text(encoding="utf-8"))
         return arm_model(str(table["arm"].get("model", "ur10e")))

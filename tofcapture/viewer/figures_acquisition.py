@@ -15,9 +15,9 @@ from tofcapture.errors import DataError
 from tofcapture.files.view import read_view
 from tofcapture.poses import Float64, transform_points
 from tofcapture.rig import Rig, load_rig
-from tofcapture.viewer.captured import view_shot
+from tofcapture.viewer.captured import arm_of, view_shot
 from tofcapture.viewer.colours import GROUND_TRUTH
-from tofcapture.viewer.figures_recording import BOARD, arm_of, links_of, pick_view, scene_views
+from tofcapture.viewer.figures_recording import BOARD, links_of, pick_view, scene_views
 from tofcapture.viewer.figures_table import (
     FONT,
     SMALL,

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
 
-from tofcapture.devices.kinematics import ArmModel, arm_model, link_frames
-from tofcapture.errors import DataError, TofError
+from tofcapture.devices.kinematics import ArmModel, link_frames
+from tofcapture.errors import DataError
 from tofcapture.files.hdf import fetch, open_checked
 from tofcapture.files.layout import VIEW
 from tofcapture.poses import Float64
@@ -72,15 +71,6 @@ def pick_view(path: Path, scene: str | None, view: int | None) -> Path:
         numbers = ", ".join(str(int(p.stem.removeprefix("view-"))) for p in paths)
         raise DataError(f"{path}: scene {paths[0].parent.name} has no view {view}", hint=f"it has {numbers}")
     return found[0]
-
-
-def arm_of(recording: Path) -> ArmModel | None:
-    """Arm that ``station.toml`` names; ``None`` where it names none that is known."""
-    try:
-        table = tomllib.loads((recording / "station.toml").read_text(encoding="utf-8"))
-        return arm_model(str(table["arm"].get("model", "ur10e")))
-    except (OSError, KeyError, AttributeError, UnicodeDecodeError, tomllib.TOMLDecodeError, TofError):
-        return None  # a picture without the arm's links is still a picture
 
 
 def links_of(path: Path, arm: ArmModel | None) -> tuple[Float64, Float64 | None]:
