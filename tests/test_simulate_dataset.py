@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -84,6 +85,22 @@ def test_shards_tell_where_they_came_from(whole):
         with ShardReader(whole / "shards" / f"{name}.h5") as shard:
             assert (shard.views, shard.frames) == (2, 2)
             assert shard.truth(0) is not None
+
+
+def test_scenes_take_turns_with_cameras(tmp_path):
+    """Two rigs: other factory calibration and fixed pattern, scene by scene; one split for all if wanted."""
+    two = replace(wish(scenes=3), cameras=2, views=1)
+    simulate_dataset(two, tmp_path / "data", jobs=1, split="test")
+    manifest = load_manifest(tmp_path / "data")
+    assert {e.split for e in manifest.scenes.values()} == {"test"}
+    serials, offsets = [], []
+    for index in range(3):
+        entry = manifest.scenes[make.scene_name(two, index)]
+        with ShardReader(tmp_path / "data" / entry.path) as shard:
+            serials.append(shard.info.serial)
+            offsets.append(shard.info.range_errors[0].offset)
+    assert serials[0] == serials[2] != serials[1]
+    assert offsets[0] == offsets[2] != offsets[1]
 
 
 def test_interrupted_in_the_middle_of_a_scene(tmp_path, whole, monkeypatch):

@@ -10,6 +10,7 @@ from tofcapture.devices.sim.scenes import TABLE_CENTRE, generator
 from tofcapture.errors import ConfigError
 from tofcapture.files.manifest import object_of
 from tofcapture.files.view import check_scene_name
+from tofcapture.suites.make import Wish
 from tofcapture.suites.recipe import SUITES, load_recipe, make_scene
 from tofcapture.suites.rooms import _PROBE
 from tofcapture.suites.tabletop import table_meshes
@@ -107,6 +108,20 @@ def test_meshes_take_their_turn(tmp_path):
         table_meshes(tmp_path, "m", 0)
     with pytest.raises(ConfigError, match="folder"):
         table_meshes(tmp_path / "gone", "mm", 0)
+
+
+def test_kinds_replace_the_pattern_and_every_mesh_has_its_turn(tmp_path):
+    """With three meshes in five scenes, no two scenes share a name; unknown kinds and other suites are refused."""
+    for name in ("one", "two", "three"):
+        (tmp_path / f"{name}.ply").write_text(PLY.format(size=80))
+    meshes = table_meshes(tmp_path, "mm", 0)
+    wish = Wish("tof100", 0, 10, meshes=meshes, kinds=("mesh", "object", "mesh", "dark", "mesh"))
+    made = [make_scene(wish.recipe(), i, 0, meshes) for i in range(10)]
+    assert [m.facts["kind"] for m in made] == list(wish.kinds) * 2
+    assert len({m.name for m in made}) == 10
+    for wrong in (Wish("tof100", 0, 1, kinds=("sphere",)), Wish("indoor", 0, 1, kinds=("mesh",))):
+        with pytest.raises(ConfigError, match="--kinds"):
+            wrong.recipe()
 
 
 def test_noise_levels_change_the_sensor_alone():

@@ -36,11 +36,26 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", type=int, default=25, help="views of each scene (default 25)")
     parser.add_argument("--frames", type=int, default=10, help="ToF frames of each view (default 10)")
     parser.add_argument(
+        "--cameras", type=int, default=1, metavar="N", help="rigs that the scenes take turns with (default 1)"
+    )
+    parser.add_argument(
+        "--kinds",
+        nargs="+",
+        default=(),
+        metavar="KIND",
+        help="kinds of scenes, in turns, instead of the recipe's (tof100): object, combination, concave, corner, bright, dark, mesh",
+    )
+    parser.add_argument(
         "--meshes", type=Path, metavar="DIR", help="meshes for a tenth of the scenes (tof100)"
     )
     parser.add_argument("--mesh-unit", default="mm", help="unit of the meshes: m, cm or mm (default mm)")
     parser.add_argument(
         "--station", type=Path, metavar="TOML", help="take the simulator's constants from its [sim]"
+    )
+    parser.add_argument(
+        "--split",
+        choices=("train", "val", "test"),
+        help="put every scene into this split (default: by their objects)",
     )
     parser.add_argument("--jobs", type=int, metavar="J", help="processes (default one per core)")
 
@@ -87,9 +102,11 @@ def _run(args: argparse.Namespace) -> Outcome:
         frames=args.frames,
         meshes=meshes,
         mesh_unit=args.mesh_unit,
+        cameras=args.cameras,
+        kinds=tuple(args.kinds),
         sim={name: table for name, table in tables.items() if isinstance(table, dict)},
     )
-    result = simulate_dataset(wish, args.out, args.jobs, _Lines())
+    result = simulate_dataset(wish, args.out, args.jobs, _Lines(), args.split)
     return Outcome(data=_data(result), text=_text(_data(result)))
 
 

@@ -13,7 +13,7 @@ import json
 import shutil
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,9 @@ from tofcapture.devices.sim import VERSION
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.seal import digest_path, sealed_digest, write_text
 from tofcapture.suites.capture import Job, layered, take_views
-from tofcapture.suites.recipe import digest, load_recipe, make_scene
+from tofcapture.suites.recipe import Recipe, digest, load_recipe, make_scene
+
+_RIGS_APART = 1_000_003
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,11 @@ class Wish:
         Files for the scenes of kind ``mesh``.
     sim
         Overrides of the simulator's constants, as in a station's ``[sim]``.
+    cameras
+        Rigs that the scenes take turns with: each its own brackets, factory calibration and fixed pattern, so that a network
+        cannot learn one camera by heart.
+    kinds
+        Kinds of scenes, in turns, instead of the recipe's pattern (tof100).
     """
 
     suite: str
@@ -49,10 +56,34 @@ class Wish:
     meshes: tuple[Path, ...] = ()
     mesh_unit: str = "mm"
     sim: Mapping[str, Any] = field(default_factory=dict)
+    cameras: int = 1
+    kinds: tuple[str, ...] = ()
+
+    def recipe(self) -> Recipe:
+        """Load the suite's recipe, with the kinds that are wanted.
+
+        Raises
+        ------
+        ConfigError
+            No such suite, or no such kind in it.
+        """
+        recipe = load_recipe(self.suite)
+        if not self.kinds:
+            return recipe
+        known = recipe.table.get("kind", {})
+        if self.suite != "tof100" or not set(self.kinds) <= set(known):
+            raise ConfigError(
+                f"--kinds: expected some of {', '.join(known)} for the suite tof100, got {' '.join(self.kinds)} for {self.suite}"
+            )
+        return replace(recipe, table={**recipe.table, "pattern": list(self.kinds)})
+
+    def rig_seed(self, index: int) -> int:
+        """Seed of the rig that takes scene ``index``; a rig's seed is the dataset's and a multiple of a large prime."""
+        return self.seed + _RIGS_APART * (index % self.cameras)
 
     def task(self, index: int) -> str:
         """Digest of everything that scene ``index`` depends on."""
-        recipe = load_recipe(self.suite)
+        recipe = self.recipe()
         table = {**asdict(self), "scenes": index, "meshes": [p.name for p in self.meshes]}
         return digest(table, recipe.table, __version__, VERSION)
 
@@ -105,7 +136,7 @@ def paths(out: Path, scene: str) -> tuple[Path, Path, Path]:
 
 def scene_name(wish: Wish, index: int) -> str:
     """Name of a scene of a dataset."""
-    return make_scene(load_recipe(wish.suite), index, wish.seed, wish.meshes, wish.mesh_unit).name
+    return make_scene(wish.recipe(), index, wish.seed, wish.meshes, wish.mesh_unit).name
 
 
 def read_note(out: Path, scene: str) -> Made | None:
@@ -144,12 +175,12 @@ def make_one(wish: Wish, out: Path, index: int) -> Made:
     from tofcapture.dataset.sample import SampleConfig
     from tofcapture.files.manifest import load_manifest
 
-    start, recipe, task = time.monotonic(), load_recipe(wish.suite), wish.task(index)
+    start, recipe, task = time.monotonic(), wish.recipe(), wish.task(index)
     scene = make_scene(recipe, index, wish.seed, wish.meshes, wish.mesh_unit)
     work, note, shard = paths(out, scene.name)
     _make_room(work, task)
     provenance = {"suite": wish.suite, "recipe": recipe.version, "index": index, "task": task}
-    job = Job(scene, wish.seed, wish.views, wish.frames, layered(recipe.sim, wish.sim), provenance)
+    job = Job(scene, wish.rig_seed(index), wish.views, wish.frames, layered(recipe.sim, wish.sim), provenance)
     cpu = take_views(job, work / "recording")
     begun = time.process_time()
     config = SampleConfig(**recipe.build)

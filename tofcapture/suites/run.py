@@ -19,7 +19,6 @@ from typing import Any
 
 from tofcapture.errors import ConfigError, TofError
 from tofcapture.suites.make import Made, Wish, finished, make_one, scene_name
-from tofcapture.suites.recipe import load_recipe
 
 Progress = Callable[[int, int], None]
 """Called with views finished and views in all, about once a second."""
@@ -57,7 +56,7 @@ class Simulated:
 
 
 def simulate_dataset(
-    wish: Wish, out: Path, jobs: int | None = None, progress: Progress | None = None
+    wish: Wish, out: Path, jobs: int | None = None, progress: Progress | None = None, split: str | None = None
 ) -> Simulated:
     """Simulate and build a dataset, or complete one.
 
@@ -71,6 +70,8 @@ def simulate_dataset(
         Processes; by default one per core. ``1`` works in this process.
     progress
         Told about once a second.
+    split
+        Of all scenes, for a dataset that is only trained on or only evaluated on; ``None``: by their objects.
 
     Raises
     ------
@@ -86,7 +87,7 @@ def simulate_dataset(
     todo = [i for i in range(wish.scenes) if i not in done]
     _check_space(wish, out, len(todo), min(jobs, len(todo)))
     made = dict(_run(wish, out, todo, jobs, lambda views: _tell(progress, wish, len(done), views)))
-    splits, gt = _finish(out, [*done.values(), *made.values()])
+    splits, gt = _finish(out, [*done.values(), *made.values()], split)
     return Simulated(out, tuple(made.values()), tuple(done.values()), splits, gt, time.monotonic() - start)
 
 
@@ -109,8 +110,12 @@ def _tell(progress: Progress | None, wish: Wish, kept: int, views: int) -> None:
 
 
 def _check(wish: Wish, out: Path) -> None:
-    load_recipe(wish.suite)
-    for name in ("scenes", "views", "frames"):
+    wish.recipe()
+    if wish.suite == "noise" and wish.cameras > 1:
+        raise ConfigError(
+            "--cameras: the suite noise holds levels of one scene against each other, by one camera"
+        )
+    for name in ("scenes", "views", "frames", "cameras"):
         if getattr(wish, name) < 1:
             raise ConfigError(f"--{name}: expected at least 1, got {getattr(wish, name)}")
     if (out / "views").exists():
@@ -184,7 +189,9 @@ def _one_thread() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _finish(out: Path, scenes: Sequence[Made]) -> tuple[dict[str, str], dict[str, Any] | None]:
+def _finish(
+    out: Path, scenes: Sequence[Made], split: str | None
+) -> tuple[dict[str, str], dict[str, Any] | None]:
     """Write manifest and card over all scenes."""
     from tofcapture.dataset.card import write_card
     from tofcapture.dataset.split import assign_splits
@@ -192,6 +199,7 @@ def _finish(out: Path, scenes: Sequence[Made]) -> tuple[dict[str, str], dict[str
     from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
 
     splits = assign_splits([m.scene for m in scenes], {m.scene: m.objects for m in scenes})
+    splits = splits if split is None else dict.fromkeys(splits, split)
     entries = {
         m.scene: SceneEntry(f"shards/{m.scene}.h5", m.sha256, m.views, splits[m.scene])
         for m in sorted(scenes, key=lambda m: m.scene)

@@ -33,7 +33,7 @@ def make(recipe: Recipe, index: int, seed: int, meshes: Sequence[Path], mesh_uni
     pattern: list[str] = recipe.table["pattern"]
     kind = pattern[index % len(pattern)]
     if kind == "mesh" and meshes:
-        turn = index // len(pattern) * pattern.count("mesh")
+        turn = index // len(pattern) * pattern.count("mesh") + pattern[: index % len(pattern)].count("mesh")
         path = meshes[turn % len(meshes)]
         name = f"{re.sub(r'[^A-Za-z0-9_.]', '_', path.stem)}-{turn // len(meshes) + 1}"
         items = [(path.stem, read_table_mesh(path, mesh_unit))]
