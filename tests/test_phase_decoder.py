@@ -89,6 +89,26 @@ def test_the_fast_decoder_is_the_oracle_to_a_hundredth_of_a_millimetre(seed, cel
     np.testing.assert_allclose(found.confidence, slow.confidence, rtol=1e-6)
 
 
+def test_signals_are_the_oracle_s_phasors_and_gap():
+    """I and Q of both frequencies, and the low minus the high range, where the reference has them; NaN where there is no light."""
+    rng = np.random.default_rng(5)
+    info = info_with(ERRORS)
+    raw = noisy(expose(rng.uniform(0.2, 7.2, CAMERA.shape), ERRORS), rng)
+    raw[:, 0, 0] = 500
+    maps, signals = Decoder(info).signals(raw, 45.0)
+    np.testing.assert_array_equal(maps.depth, Decoder(info)(raw, 45.0).depth)
+    phasor = phasors(raw, info.modulation_hz, info.phase_rad)
+    np.testing.assert_allclose(signals.phasor, np.stack([phasor.real, phasor.imag], 1), atol=1e-3)
+    _, slow = oracle(raw, info, 45.0)
+    full, step = ambiguity(HZ[0]), ambiguity(HZ[-1])
+    expected = np.mod(slow.range_low - slow.range_high + full / 2, full) - full / 2
+    apart = np.abs(signals.gap - expected)
+    assert np.isnan(signals.gap[0, 0])
+    lit = np.isfinite(signals.gap)
+    # Half a step may be rounded to either side; the low frequency's table is coarser than the high one's.
+    assert np.minimum(apart, step - apart)[lit].max() < 1e-4
+
+
 def test_decoded_depth_is_the_scene():
     """Errors, lamp and all: from exact taps comes the exact depth."""
     radial = np.random.default_rng(0).uniform(0.3, 7.0, CAMERA.shape)

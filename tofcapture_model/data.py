@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from tofcapture.camera import Camera
 from tofcapture.errors import DataError
 from tofcapture.files.layout import MaskBit
 from tofcapture.frames import TofInfo
-from tofcapture.ops.phase import Decoded, ambiguity, decode, frequencies, phasors
+from tofcapture.ops.phase import Decoder, frequencies
 from tofcapture_model.frame import NO_MAPS, Frame, Target
 from tofcapture_model.multipath import cues
 from tofcapture_model.shards import SampleId, all_samples, open_scenes
@@ -38,18 +39,13 @@ def fill_nearest(image: Float32, valid: NDArray[np.bool_]) -> Float32:
     return out
 
 
-def _decode_frame(
-    raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float
-) -> tuple[NDArray[np.complex128], Decoded]:
-    phasor = phasors(raw, info.modulation_hz, info.phase_rad)
-    saturated: NDArray[np.bool_] = np.asarray((raw >= info.saturation).any(axis=0))
-    decoded = decode(
-        phasor, info.modulation_hz, camera, info.illuminator, info.range_errors, celsius, saturated=saturated
-    )
-    return phasor, decoded
-
-
-def make_frame(raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float = float("nan")) -> Frame:
+def make_frame(
+    raw: NDArray[Any],
+    info: TofInfo,
+    camera: Camera,
+    celsius: float = float("nan"),
+    decoder: Decoder | None = None,
+) -> Frame:
     """Decode one raw frame into what a network reads, as tensors without a batch axis.
 
     Parameters
@@ -62,20 +58,19 @@ def make_frame(raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float 
         Intrinsics of the ToF camera.
     celsius
         Sensor temperature; NaN: unknown.
+    decoder
+        :func:`frame_decoder` of the same camera; ``None`` builds its tables anew, which takes as long as some frames.
     """
-    phasor, decoded = _decode_frame(raw, info, camera, celsius)
-    depth = camera.radial_to_depth(decoded.radial).astype(np.float32)
+    maps, signals = (decoder or frame_decoder(info, camera)).signals(raw, celsius)
+    depth = maps.depth
     valid = np.isfinite(depth) & (depth > 0.05) & (depth < MAX_RANGE)
-    low = ambiguity(frequencies(info.modulation_hz)[0])
-    gap = np.mod(decoded.range_low - decoded.range_high + low / 2, low) - low / 2
-    iq = np.stack([part for z in phasor for part in (z.real, z.imag)])
     frame = Frame(
-        raw=_tensor(raw / info.saturation),
-        phasor=_tensor(iq / info.saturation),
+        raw=_tensor(raw) / info.saturation,
+        phasor=_tensor(signals.phasor.reshape(4, *depth.shape)) / info.saturation,
         depth=_tensor(fill_nearest(depth, valid)[None]),
         valid=_tensor(valid[None]),
-        confidence=_tensor(decoded.confidence[None] / info.saturation),
-        gap=_tensor(gap[None]),
+        confidence=_tensor(maps.confidence[None]) / info.saturation,
+        gap=_tensor(np.nan_to_num(signals.gap[None])),
         cues=torch.empty(0),
         modulation=torch.tensor(frequencies(info.modulation_hz), dtype=torch.float32),
         intrinsics=torch.tensor([camera.pinhole("network input").fx, camera.fy, camera.cx, camera.cy]),
@@ -85,6 +80,11 @@ def make_frame(raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float 
     return frame._replace(
         cues=cues(whole.phasor, whole.depth, whole.valid, whole.gap, whole.intrinsics, high)[0]
     )
+
+
+def frame_decoder(info: TofInfo, camera: Camera) -> Decoder:
+    """Tables for :func:`make_frame`, by the calibrated intrinsics."""
+    return Decoder(replace(info, camera=camera))
 
 
 def _tensor(array: NDArray[Any]) -> Tensor:
@@ -171,6 +171,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
             )
         self._frames: dict[SampleId, Frame] = {}
         self._targets: dict[tuple[str, int], Target] = {}
+        self._decoders: dict[str, Decoder] = {}
 
     def __len__(self) -> int:
         return len(self.samples)
@@ -192,7 +193,10 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
             return self._frames[sample]
         reader = self.readers[sample.scene]
         celsius = reader.celsius(sample.view, sample.frame)
-        frame = make_frame(reader.raw(sample.view, sample.frame), reader.info, reader.camera, celsius)
+        if sample.scene not in self._decoders:
+            self._decoders[sample.scene] = frame_decoder(reader.info, reader.camera)
+        raw = reader.raw(sample.view, sample.frame)
+        frame = make_frame(raw, reader.info, reader.camera, celsius, self._decoders[sample.scene])
         if (len(self._frames) + 1) * sum(x.nbytes for x in frame) < self.cache_bytes:
             self._frames[sample] = frame
         return frame

@@ -16,7 +16,7 @@ from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.geometry import plane_normals, rays, side_window_planes
 
 SIGNAL = 0.04  # of saturation: amplitude of a white patch that faces the sensor at 1 m; networks correct it by a factor
-STEP = 8  # pixels per patch
+STEP = 10  # pixels per patch
 BOUNCES = 3  # the fourth adds less than the first lacks in knowledge
 _WHITEST = 0.9  # albedo
 _FAR = 3.0  # m
@@ -44,10 +44,20 @@ def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: 
     """
     high = phasor[:, 2:]
     amplitude = high.square().sum(1, keepdim=True).sqrt()
-    seen = bounce_error(depth, valid, amplitude, intrinsics, hz)
-    beyond = bounce_error(depth, valid, amplitude, intrinsics, hz, margin=8)
-    broad = _blur(gap.clamp(-0.3, 0.3) * valid, 8) / _blur(valid, 8).clamp_min(1e-3)
-    return torch.cat([seen, beyond, halo_error(high, hz), broad], dim=1)
+    maps = surface(depth, valid, amplitude, intrinsics)
+    seen = exchange_error(maps, intrinsics, hz)
+    beyond = exchange_error(maps, intrinsics, hz, step=2 * STEP, margin=3)
+    return torch.cat([seen, beyond, halo_error(high, hz), _broad(gap.clamp(-0.3, 0.3), valid)], dim=1)
+
+
+def _broad(image: Tensor, valid: Tensor, shrink: int = 4) -> Tensor:
+    """Mean over some 30 pixels of what is valid, on cells of ``shrink`` pixels."""
+    cells = F.avg_pool2d(
+        torch.cat([image * valid, valid], dim=1), shrink, ceil_mode=True, count_include_pad=False
+    )
+    total, weight = _blur(cells, 2).chunk(2, dim=1)
+    mean = total / weight.clamp_min(1e-3)
+    return F.interpolate(mean, size=image.shape[-2:], mode="bilinear", align_corners=False)
 
 
 def _blur(image: Tensor, radius: int) -> Tensor:
@@ -118,16 +128,26 @@ def bounce_error(
     -------
     (B, 1, H, W) metres, positive where things look too far away
     """
+    return exchange_error(surface(depth, valid, amplitude, intrinsics), intrinsics, hz, step, margin)
+
+
+def surface(depth: Tensor, valid: Tensor, amplitude: Tensor, intrinsics: Tensor) -> Tensor:
+    """Tangent planes and light of every pixel (B, 5, H, W): unit normal, ``n . p`` in metres, amplitude times squared depth."""
     planes, _ = side_window_planes(depth, valid + 1e-3, 2)
     normals = plane_normals(planes, intrinsics)
     smooth = (1 / planes[:, :1].clamp_min(0.1)) * valid + depth * (1 - valid)
-    distance = (normals * rays(intrinsics, *depth.shape[-2:])).sum(
-        1, keepdim=True
-    ) * smooth  # n . p, negative
+    # n . p, negative
+    distance = (normals * rays(intrinsics, *depth.shape[-2:])).sum(1, keepdim=True) * smooth
     light = F.avg_pool2d(amplitude, 3, 1, 1, count_include_pad=False) * valid
-    maps = torch.cat([normals, distance, light * smooth.square()], dim=1)[
-        :, :, step // 2 :: step, step // 2 :: step
-    ]
+    return torch.cat([normals, distance, light * smooth.square()], dim=1)
+
+
+def exchange_error(
+    surfaces: Tensor, intrinsics: Tensor, hz: float, step: int = STEP, margin: int = 0
+) -> Tensor:
+    """Depth error of the light that the patches of :func:`surface` exchange; the rest as in :func:`bounce_error`."""
+    size = surfaces.shape[-2:]
+    maps = surfaces[:, :, step // 2 :: step, step // 2 :: step]
     h, w = maps.shape[-2:]
     around = F.pad(maps, (margin, margin, margin, margin), mode="replicate")
     grid = torch.cat([intrinsics[:, :2] / step, (intrinsics[:, 2:] - step // 2) / step + margin], dim=1)
@@ -138,7 +158,7 @@ def bounce_error(
         ]
     )
     inner = found.reshape(-1, 1, *around.shape[-2:])[..., margin : margin + h, margin : margin + w]
-    return F.interpolate(inner, size=depth.shape[-2:], mode="bilinear", align_corners=False)
+    return F.interpolate(inner, size=size, mode="bilinear", align_corners=False)
 
 
 def _exchange(maps: Tensor, r: Tensor, grid: Tensor, hz: float) -> Tensor:

@@ -7,7 +7,7 @@ complex number ``A exp(i phi)``. Bursts are averaged as phasors, never as phases
 """
 
 from tofcapture.ops.phase.decode import Decoded, decode
-from tofcapture.ops.phase.decoder import Decoder, DepthMaps, TapNoise
+from tofcapture.ops.phase.decoder import Decoder, DepthMaps, Signals, TapNoise
 from tofcapture.ops.phase.flying import flying_pixels
 from tofcapture.ops.phase.phasor import (
     Complex128,
@@ -28,6 +28,7 @@ __all__ = [
     "Decoder",
     "DepthMaps",
     "Float64",
+    "Signals",
     "TapNoise",
     "Unwrapping",
     "ambiguity",

@@ -64,6 +64,23 @@ class DepthMaps:
     flags: NDArray[np.uint8]
 
 
+@dataclass(frozen=True)
+class Signals:
+    """What was on the way from taps to depth.
+
+    Attributes
+    ----------
+    phasor
+        (2, 2, H, W) float32: I and Q of the low, then of the high frequency; raw units.
+    gap
+        (H, W) float32: range of the low minus range of the high frequency, within half a range of the high one; metres, NaN
+        where there is no light.
+    """
+
+    phasor: Float32
+    gap: Float32
+
+
 class Decoder:
     """Decodes raw frames of one camera.
 
@@ -138,6 +155,14 @@ class Decoder:
         self._expect(raw.shape)
         return self._decode(raw, celsius, 1, self._saturated(raw.max(axis=0)), out)
 
+    def signals(self, raw: NDArray[Any], celsius: float = float("nan")) -> tuple[DepthMaps, Signals]:
+        """Decode one frame (K, H, W), or the mean of some, and keep the phasors and the gap between the frequencies."""
+        self._expect(raw.shape)
+        shape = self.info.camera.shape
+        kept = Signals(np.empty((2, 2, *shape), np.float32), np.empty(shape, np.float32))
+        maps = self._decode(raw, celsius, 1, self._saturated(raw.max(axis=0)), kept=kept)
+        return maps, kept
+
     def burst(self, raw: NDArray[Any], celsius: float = float("nan")) -> DepthMaps:
         """Decode a burst (frames, K, H, W), averaged as I and Q; a pixel is saturated when it is in any frame."""
         self._expect(raw.shape[1:])
@@ -162,6 +187,7 @@ class Decoder:
         frames: int,
         saturated: NDArray[np.bool_],
         out: DepthMaps | None = None,
+        kept: Signals | None = None,
     ) -> DepthMaps:
         camera = self.info.camera
         celsius = celsius if np.isfinite(celsius) else _UNKNOWN_CELSIUS
@@ -172,8 +198,10 @@ class Decoder:
         bad = np.empty(n, bool)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             for at in _blocks(n):
-                phases = self._phases(flat[:, at], frames, confidence[at], flags[at], bad[at])
-                self._ranges(phases, at, celsius, flags[at])
+                iq = None if kept is None else kept.phasor.reshape(2, 2, -1)[..., at]
+                phases = self._phases(flat[:, at], frames, confidence[at], flags[at], bad[at], iq)
+                gap = None if kept is None else kept.gap.reshape(-1)[at]
+                self._ranges(phases, at, celsius, flags[at], gap)
                 self._depth(phases, at, depth[at], bad[at])
         image, bits = out.depth, out.flags
         bits |= saturated
@@ -188,6 +216,7 @@ class Decoder:
         confidence: Float32,
         flags: NDArray[np.uint8],
         bad: NDArray[np.bool_],
+        iq: Float32 | None,
     ) -> tuple[Float32, Float32]:
         """Phases of both frequencies in turns, [0, 1), and scratch; amplitude and what it decides on the way."""
         n = raw.shape[1]
@@ -207,11 +236,18 @@ class Decoder:
         np.copyto(confidence, size[1])
         if self._darkness.size:
             np.divide(self._dark, size, out=self._darkness[:, :n])
+        if iq is not None:
+            iq[:, 0], iq[:, 1] = real, imag
         turns_of(real, imag, size, work)
         return size, work
 
     def _ranges(
-        self, phases: tuple[Float32, Float32], at: slice, celsius: float, flags: NDArray[np.uint8]
+        self,
+        phases: tuple[Float32, Float32],
+        at: slice,
+        celsius: float,
+        flags: NDArray[np.uint8],
+        kept: Float32 | None,
     ) -> None:
         """Ranges without their systematic errors, the high one unwrapped, both fused; the result lies in the low one."""
         (low, high), (gap, work) = phases
@@ -221,6 +257,8 @@ class Decoder:
         np.subtract(low, high, out=gap)
         gap *= 1 / self._R[1]
         gap -= np.rint(gap, out=work)
+        if kept is not None:
+            np.multiply(gap, self._R[1], out=kept)
         np.abs(gap, out=work)
         flags |= (work > _AMBIGUOUS).view(np.uint8) * np.uint8(TofFlag.AMBIGUOUS)
         gap *= self._lean
