@@ -10,6 +10,7 @@ torch = pytest.importorskip("torch")
 from tofcapture_model.config import Losses
 from tofcapture_model.frame import Estimate, Target
 from tofcapture_model.losses import (
+    angle_loss,
     cosine_loss,
     error_map_loss,
     objective,
@@ -90,6 +91,23 @@ def test_eq_3_knows_angles_and_forgets_lengths():
     for i, expected in enumerate((0.0, 1.0, 2.0)):
         mask = (torch.arange(3) == i).reshape(1, 1, 1, 3)
         assert cosine_loss(normals, gt, mask).item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_angle_loss_is_an_angle_whose_pull_does_not_fade():
+    """Near zero it is the angle in radians and its gradient is one per radian; opposite vectors cost 2."""
+    gt = torch.tensor([0.0, 0, -1]).reshape(1, 3, 1, 1)
+    mask = torch.ones(1, 1, 1, 1)
+    for degrees in (1.0, 5.0, 20.0):
+        angle = torch.tensor(degrees).deg2rad().requires_grad_()
+        normals = torch.stack([angle.sin(), angle * 0, -angle.cos()]).reshape(1, 3, 1, 1)
+        loss = angle_loss(normals, gt, mask)
+        assert loss.item() == pytest.approx(2 * torch.sin(angle / 2).item(), abs=2e-3)
+        loss.backward()
+        assert angle.grad.item() == pytest.approx(1.0, abs=0.03)
+    assert angle_loss(-gt, gt, mask).item() == pytest.approx(2.0, abs=2e-3)
+    perfect = gt.clone().requires_grad_()
+    angle_loss(perfect, gt, mask).backward()
+    assert torch.isfinite(perfect.grad).all()
 
 
 def test_an_empty_mask_costs_exactly_nothing():

@@ -18,7 +18,9 @@ torch = pytest.importorskip("torch")
 from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, FormatError
+from tofcapture.files.cache import pack
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
+from tofcapture.files.seal import sha256_of
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, TofMaps
 from tofcapture.files.shard_writer import ShardWriter
 from tofcapture.frames import StereoInfo, TofInfo
@@ -275,6 +277,38 @@ def test_another_configuration_does_not_continue_a_run(dataset, tiny, trained):
     """A run folder belongs to one configuration."""
     with pytest.raises(ConfigError, match="another configuration"):
         train(replace(tiny, losses=replace(tiny.losses, delta=0.01)), dataset, trained[0])
+
+
+def test_fine_tuning_starts_from_weights(dataset, tiny, trained, tmp_path):
+    """The first step has the loss of the given weights; weights of another network are refused; the origin is told."""
+    config = replace(tiny, training=replace(tiny.training, seed=3))
+    train(config, dataset, tmp_path / "new", stop_after=1)
+    train(config, dataset, tmp_path / "on", start=trained[1].path)
+    first = [
+        json.loads((tmp_path / name / "metrics.jsonl").read_text().splitlines()[0])["total"]
+        for name in ("new", "on")
+    ]
+    assert first[1] < first[0]
+    provenance = load_model(tmp_path / "on")[2]
+    assert provenance["start_sha256"] == sha256_of(trained[1].path)
+    other = replace(tiny, network=replace(tiny.network, width=5))
+    with pytest.raises(ConfigError, match="expected weights of the configuration's network"):
+        train(other, dataset, tmp_path / "other", start=trained[1].path)
+
+
+def test_a_packed_cache_gives_the_same_weights(dataset, tiny, trained, tmp_path):
+    """Training from the flat files of `tofcapture pack` takes the very same steps."""
+    pack(dataset, "train", tmp_path / "cache")
+    train(tiny, dataset, tmp_path / "run", cache=tmp_path / "cache")
+    a, b = (load_model(out)[0].state_dict() for out in (tmp_path / "run", trained[0]))
+    assert all(torch.equal(a[k], b[k]) for k in a)
+
+
+def test_a_loss_that_is_not_finite_stops_before_it_spoils_anything(dataset, tiny, tmp_path):
+    """An absurd learning rate: a clear error, and the last resume point is finite."""
+    config = replace(tiny, stages=(Stage("joint", 50, 1e30),))
+    with pytest.raises(DataError, match="finite loss"):
+        train(config, dataset, tmp_path / "run")
 
 
 def test_the_paper_s_stages_run_in_order(dataset, tiny, tmp_path):

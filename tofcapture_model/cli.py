@@ -67,6 +67,13 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--workers", type=int, default=0, help="processes that read data (default: 0, data stays in memory)"
     )
+    parser.add_argument(
+        "--from",
+        dest="start",
+        metavar="WEIGHTS",
+        help="fine-tune: start from a checkpoint, a run's folder, or 'bundled' (default preset: fine-tune)",
+    )
+    parser.add_argument("--cache", type=Path, help="read frames from what `tofcapture pack` wrote")
     _device(parser)
 
 
@@ -75,8 +82,17 @@ def _config(args: argparse.Namespace) -> Config:
         raise ConfigError(
             "--config and --preset exclude each other", hint='write preset = "..." into the TOML'
         )
-    config = load_config(args.config) if args.config else preset(args.preset or "compact")
+    usual = "fine-tune" if args.start else "compact"
+    config = load_config(args.config) if args.config else preset(args.preset or usual)
     return config if args.seed is None else replace(config, training=replace(config.training, seed=args.seed))
+
+
+def _start(name: str | None) -> Path | None:
+    if name is None:
+        return None
+    from tofcapture_model.checkpoint import find_model
+
+    return find_model(None if name == "bundled" else Path(name))
 
 
 def _train(args: argparse.Namespace) -> Outcome:
@@ -93,6 +109,8 @@ def _train(args: argparse.Namespace) -> Outcome:
             minutes=args.minutes,
             device=_checked_device(args.device),
             workers=args.workers,
+            cache=args.cache,
+            start=_start(args.start),
             report=report,
         )
     data: dict[str, Any] = {

@@ -100,8 +100,10 @@ class Losses:
     uncertainty
         What the error map learns: ``l1``, the expected absolute error (paper), or ``laplace``, the scale of a Laplace
         distribution, which is then calibrated on the ``val`` split to be one sigma.
+    normals
+        Distance of normals: ``cosine``, eq. 3 (paper), or ``angle``, whose gradient does not fade with the angle.
     depth, chamfer, error, normal
-        Weights of eq. 1, eq. 2 (in 1/mm^2), the error map, eq. 3.
+        Weights of eq. 1, eq. 2 (in 1/mm^2), the error map, the normals.
     context
         Weight of measured surface outside the object crop relative to the object.
     """
@@ -110,6 +112,7 @@ class Losses:
     jitter: float = 0.010
     reweight: bool = True
     uncertainty: str = "l1"
+    normals: str = "cosine"
     depth: float = 1.0
     chamfer: float = 0.01
     error: float = 1.0
@@ -123,6 +126,7 @@ class Losses:
         _require(
             self.uncertainty in ("l1", "laplace"), "losses.uncertainty", "l1 or laplace", self.uncertainty
         )
+        _require(self.normals in ("cosine", "angle"), "losses.normals", "cosine or angle", self.normals)
         _require(
             min(self.depth, self.chamfer, self.error, self.normal, self.context) >= 0,
             "losses",

@@ -87,9 +87,8 @@ def calibrate(model: JointModel, dataset: Path, device: torch.device) -> dict[st
         return {"factor": float(model.error_map.calibration), "views": 0}
     data = FrameDataset(dataset, "val", frames=1, cache_bytes=0)
     model.eval()
-    for _ in range(
-        2
-    ):  # the refinement weighs by the error map, so that the depth moves a little with the factor
+    # Twice: the refinement weighs by the error map, so that the depth moves a little with the factor.
+    for _ in range(2):
         ratios = torch.cat([_ratios(model, data, sample, device) for sample in data.samples])
         if len(ratios):
             model.error_map.calibration.mul_(

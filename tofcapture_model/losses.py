@@ -19,6 +19,7 @@ _PER_MM2 = 1e6  # m^2 to mm^2, so that the Chamfer weight is of the order of the
 DELTA = 0.020  # m, paper: threshold 20 (mm) of eq. 1
 EPSILON = 1e-6  # m, paper: 0.001 (mm) in lambda = d / (e + epsilon)
 MIN_ERROR = 0.001  # m; see reweighting()
+_SMALL_CHORD = 1e-3  # the root has no slope at zero
 MIN_SCALE = 1e-4  # m; the likelihood of a perfect pixel has no bound
 
 
@@ -110,6 +111,22 @@ def cosine_loss(normals: Tensor, gt: Tensor, mask: Tensor) -> Tensor:
     return masked_mean(1 - cosine, mask)
 
 
+def angle_loss(normals: Tensor, gt: Tensor, mask: Tensor) -> Tensor:
+    """Mean chord ``|n1 - n2|`` of unit normals over the mask: the angle in radians where it is small, at most 2.
+
+    Eq. 3 is half its square: at a few degrees hardly anything pulls there any more.
+
+    Parameters
+    ----------
+    normals, gt
+        (B, 3, H, W), any length.
+    mask
+        (B, 1, H, W) bool or weight.
+    """
+    apart = unit(normals.float()) - unit(_inside(gt, mask, normals))
+    return masked_mean((apart.square().sum(1, keepdim=True) + _SMALL_CHORD**2).sqrt() - _SMALL_CHORD, mask)
+
+
 class Objective(NamedTuple):
     """Total loss of a step and its parts, all scalars without unit; ``winners`` counts the Chamfer candidates (7,)."""
 
@@ -159,7 +176,8 @@ def objective(
             parts["chamfer"] = weights.chamfer * _PER_MM2 * chamfer.loss.mean()
             winners = torch.bincount(chamfer.winner.cpu(), minlength=7).float()
     if stage != "depth":
-        parts["normal"] = weights.normal * cosine_loss(normals, target.normals, weight)
+        distance = angle_loss if weights.normals == "angle" else cosine_loss
+        parts["normal"] = weights.normal * distance(normals, target.normals, weight)
     return Objective(torch.stack(list(parts.values())).sum(), parts, winners)
 
 

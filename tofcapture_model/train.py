@@ -16,10 +16,17 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from tofcapture.errors import ConfigError
+from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.seal import sha256_of
-from tofcapture_model.checkpoint import load_resume, load_strictly, save_model, save_resume
+from tofcapture_model.checkpoint import (
+    find_model,
+    load_model,
+    load_resume,
+    load_strictly,
+    save_model,
+    save_resume,
+)
 from tofcapture_model.config import Config, Stage, dumps_config
 from tofcapture_model.data import FrameDataset, collate, epoch_batches
 from tofcapture_model.evaluate import calibrate, model_method, score
@@ -66,6 +73,8 @@ def train(
     stop_after: int | None = None,
     device: str = "cpu",
     workers: int = 0,
+    cache: Path | None = None,
+    start: Path | None = None,
     report: Callable[[str, float, str], None] = lambda _what, _done, _text: None,
 ) -> Trained:
     """Train all stages of a configuration on the ``train`` split of a dataset.
@@ -90,6 +99,10 @@ def train(
         Torch device; under ``torchrun`` with CUDA each process takes its own.
     workers
         Processes that read data; 0 keeps decoded frames in memory, best for small datasets.
+    cache
+        Folder that ``tofcapture pack`` filled with the ``train`` split; ``None`` reads the shards.
+    start
+        Checkpoint to start from instead of random weights (fine-tuning); its network must be the configuration's.
     report
         Called with (stage, fraction done, one line of text).
 
@@ -107,7 +120,9 @@ def train(
         torch.manual_seed(config.training.seed)
         model = build_model(config).to(place)
         source = {"dataset": str(dataset), "manifest_sha256": sha256_of(Path(dataset) / "manifest.json")}
-        key = _key(config, source["manifest_sha256"], minutes)
+        if start is not None:
+            source |= {"start": str(start), "start_sha256": _begin_with(model, config, start)}
+        key = _key(config, source, minutes)
         position, moments = _resume(out, model, key)
         if position.stage == len(config.stages):
             return Trained(out / "model.safetensors", position.step, finished=True, losses={})
@@ -119,6 +134,7 @@ def train(
             seed=config.training.seed,
             frames=config.training.frames,
             cache_bytes=0 if workers else 1.5e9,
+            cache=cache,
         )
         log = Log(out if rank == 0 else None)
         losses: dict[str, float] = {}
@@ -149,6 +165,7 @@ def train(
                         estimate = called(frame, stage.name)
                     estimate = Estimate(*(x.float() for x in estimate))
                     loss = training_loss(model, config.losses, stage.name, estimate, target, frame)
+                    _expect_finite(float(loss.total.detach()), position, out)
                     optimizer.zero_grad(set_to_none=True)
                     loss.total.backward()  # type: ignore[no-untyped-call]
                     nn.utils.clip_grad_norm_(learning, 1.0)
@@ -188,9 +205,32 @@ def train(
         return Trained(out / "model.safetensors", position.step, finished=True, losses=losses)
 
 
-def _key(config: Config, manifest: str, minutes: float | None) -> str:
+def _expect_finite(loss: float, position: Position, out: Path) -> None:
+    """Stop before a step that would spoil the weights."""
+    if not math.isfinite(loss):
+        raise DataError(
+            f"{out}: expected a finite loss, got {loss} at step {position.step + 1}",
+            hint="the last resume point is sound: check the dataset (tofcapture check), or lower the learning rate",
+        )
+
+
+def _begin_with(model: Model, config: Config, start: Path) -> str:
+    """Give the model the weights of a checkpoint; returns the checkpoint's digest."""
+    other, its, _ = load_model(start)
+    if its.network != config.network:
+        raise ConfigError(
+            f"{start}: expected weights of the configuration's network ({config.network.kind}), got {its.network.kind} with other sizes or kind",
+            hint=f"--config {find_model(start).with_suffix('.toml')} has its configuration",
+        )
+    load_strictly(model, other.state_dict(), start)
+    return sha256_of(find_model(start))
+
+
+def _key(config: Config, source: Mapping[str, str], minutes: float | None) -> str:
     """Digest of all that decides what a run computes; a resume point of another run is refused."""
-    return hashlib.sha256(f"{dumps_config(config)}|{manifest}|{minutes}".encode()).hexdigest()
+    begun = source.get("start_sha256", "")
+    text = f"{dumps_config(config)}|{source['manifest_sha256']}|{minutes}{begun}"
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _state(position: Position, key: str) -> dict[str, Any]:
