@@ -14,7 +14,8 @@ from tofcapture.frames import TofInfo
 from tofcapture.ops.normals import normals_from_depth
 from tofcapture.ops.phase import Decoder, TapNoise, ambiguity, frequencies, phasors, radial_to_range, taps
 from tofcapture.rig import RangeError
-from tofcapture_model.augment import RawItem, crop, flip, redraw_noise, scale_albedo
+from tofcapture_model.augment import RawItem, crop, flip, redraw_frame, redraw_noise, scale_albedo
+from tofcapture_model.data import batched, frame_decoder, make_frame
 
 CAMERA = Camera(24, 18, 20.0, 21.0, 11.2, 9.1)
 LIGHT = np.array([0.03, 0.01, 0.0])
@@ -117,6 +118,26 @@ def test_redrawn_noise_is_that_of_one_frame():
     assert (np.rint(out) == out).all()
     one = redraw_noise(torch.from_numpy(burst.mean(0)), generator, averaged=4, noise=noise)
     assert one.shape == (8, 6, 6)
+
+
+def test_a_redrawn_frame_is_decoded_like_a_frame_of_the_burst():
+    """Depth, gap, confidence and phasors scatter about the same means by as much as those of decoded single frames."""
+    noise, rng, clean = TapNoise(16.0, 1.25), np.random.default_rng(3), clean_taps()
+    info = TofInfo("", "", CAMERA, LIGHT, range_errors=ERRORS)
+    burst = rng.poisson(np.broadcast_to(clean, (400, *clean.shape)) * 16) / 16
+    burst = np.rint(burst + 1.25 * rng.standard_normal(burst.shape))
+    decoder = frame_decoder(info, CAMERA)
+    real = [make_frame(raw, info, CAMERA, decoder=decoder) for raw in burst]
+    mean = batched(make_frame(burst.mean(0), info, CAMERA, decoder=decoder))
+    generator = torch.Generator().manual_seed(4)
+    drawn = [redraw_frame(mean, generator, averaged=400, noise=noise) for _ in range(400)]
+    for field in ("depth", "gap", "confidence", "phasor"):
+        a = torch.stack([getattr(f, field) for f in real])
+        b = torch.stack([getattr(f, field)[0] for f in drawn])
+        assert (b.std(0) / a.std(0)).median().item() == pytest.approx(1, abs=0.02), field
+        assert ((b.mean(0) - a.mean(0)).abs() / a.std(0)).max() < 0.4, field
+    assert drawn[0].depth.dtype == torch.float32
+    assert drawn[0].cues is mean.cues
 
 
 def test_a_darker_world_has_less_signal_the_same_ambient_and_the_noise_of_its_taps():

@@ -16,11 +16,11 @@ from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.baselines import lf2
 from tofcapture_model.baselines.coarse_fine import CoarseFine
 from tofcapture_model.baselines.guo2018 import MRM, demodulation
-from tofcapture_model.baselines.protocol import Baseline, turn, turned_depth
+from tofcapture_model.baselines.protocol import Baseline
 from tofcapture_model.baselines.sensor import upsample_depth
 from tofcapture_model.config import BASELINES, Config, Losses, Stage, loads_config, preset
 from tofcapture_model.frame import Target
-from tofcapture_model.geometry import rays
+from tofcapture_model.geometry import rays, turn, turned_depth
 from tofcapture_model.zoo import build_model, select_stage, training_loss
 
 

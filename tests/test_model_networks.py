@@ -31,7 +31,7 @@ from tofcapture_model.unet import UNet, bilinear_logits, convex_upsample, pad_to
 from tofcapture_model.zoo import build_model, select_stage
 
 TINY_PAPER = Network(width=2, levels=3, refine_iterations=1)
-TINY_COMPACT = replace(preset("demo").network, width=4, levels=2)
+TINY_COMPACT = replace(preset("demo").network, width=4, levels=2, refine_iterations=1)
 
 
 def frame(h=36, w=44, batch=2, seed=0):
@@ -49,6 +49,7 @@ def frame(h=36, w=44, batch=2, seed=0):
         cues=0.01 * torch.randn(batch, 4, h, w, generator=g),
         modulation=torch.tensor([[20e6, 100e6]]).expand(batch, 2),
         intrinsics=k,
+        demodulation=torch.zeros(batch, 4, 8),
     )
 
 

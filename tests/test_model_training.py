@@ -304,6 +304,21 @@ def test_a_packed_cache_gives_the_same_weights(dataset, tiny, trained, tmp_path)
     assert all(torch.equal(a[k], b[k]) for k in a)
 
 
+def test_drawn_noise_is_another_one_at_every_step_and_resumes_to_the_same_bits(dataset, tiny, tmp_path):
+    """One item a view; a stopped and resumed run has the weights of an unbroken one, other seeds have others."""
+    drawn = replace(tiny, training=replace(tiny.training, noise="drawn"))
+    train(drawn, dataset, tmp_path / "one")
+    train(drawn, dataset, tmp_path / "two", stop_after=1)
+    train(drawn, dataset, tmp_path / "two")
+    train(replace(drawn, training=replace(drawn.training, seed=1)), dataset, tmp_path / "other")
+    one, two, other = (load_model(tmp_path / n)[0].state_dict() for n in ("one", "two", "other"))
+    assert all(torch.equal(one[k], two[k]) for k in one)
+    assert not all(torch.equal(one[k], other[k]) for k in one)
+    data = FrameDataset(dataset, "train", mean=True)
+    assert len(data) == 6
+    assert data.averaged == 2
+
+
 def test_a_loss_that_is_not_finite_stops_before_it_spoils_anything(dataset, tiny, tmp_path):
     """An absurd learning rate: a clear error, and the last resume point is finite."""
     config = replace(tiny, stages=(Stage("joint", 50, 1e30),))

@@ -19,6 +19,8 @@ from torch import Tensor
 
 from tofcapture.errors import ConfigError
 from tofcapture.ops.phase import TapNoise
+from tofcapture_model.frame import Frame
+from tofcapture_model.geometry import metres_per_radian, rays, turn
 
 FULL_SCALE = 4095.0  # raw units where a 12-bit sensor saturates
 
@@ -177,3 +179,44 @@ def redraw_noise(
     float32 of whole numbers, shaped like ``taps``.
     """
     return scale_albedo(taps, 1.0, 0.0, generator, averaged=averaged, noise=noise, full_scale=full_scale)
+
+
+def redraw_frame(
+    frame: Frame,
+    generator: torch.Generator,
+    *,
+    averaged: float,
+    noise: TapNoise | None = None,
+    full_scale: float = FULL_SCALE,
+) -> Frame:
+    """One more frame of a static burst, decoded: fresh noise on the taps, and what it does to phasors, depth and gap.
+
+    The turn of each phasor moves the range of its frequency, so calibration and wraps stay those of the mean. Cues stay, too:
+    they are smooth. Holes keep their filling.
+
+    Parameters
+    ----------
+    frame
+        Decoded from the mean of ``averaged`` frames; (B, ., H, W).
+    generator, averaged, noise, full_scale
+        As for :func:`redraw_noise`; the generator is of the frame's device.
+
+    Returns
+    -------
+    A frame like one of the burst: same statistics of raw, phasor, depth, confidence and gap.
+    """
+    raw = redraw_noise(
+        frame.raw * full_scale, generator, averaged=averaged, noise=noise, full_scale=full_scale
+    )
+    raw = raw / full_scale
+    phasor = torch.einsum("bck,bkhw->bchw", frame.demodulation, raw)
+    low = turn(phasor[:, :2], frame.phasor[:, :2]) * metres_per_radian(frame, 0)
+    high = turn(phasor[:, 2:], frame.phasor[:, 2:]) * metres_per_radian(frame, 1)
+    confidence = phasor[:, 2:].square().sum(1, keepdim=True).sqrt()
+    square = frame.modulation.square()
+    lean = (square[:, :1] / square.sum(1, keepdim=True)).reshape(-1, 1, 1, 1)  # as the decoder fuses
+    length = rays(frame.intrinsics, *frame.depth.shape[-2:]).square().sum(1, keepdim=True).sqrt()
+    depth = frame.depth + frame.valid * (high + lean * (low - high)) / length
+    return frame._replace(
+        raw=raw, phasor=phasor, depth=depth, gap=frame.gap + low - high, confidence=confidence
+    )

@@ -165,6 +165,9 @@ class Training:
         (height, width) of training crops at sensor resolution; () takes whole frames.
     frames
         Use the first so many frames of every view; 0: all. Frames of a view differ in noise only, and each is decoded once.
+    noise
+        ``recorded``: frames as they were taken; ``drawn``: the mean of each view's frames with fresh shot and read noise, drawn on
+        the training device, so that no frame is ever seen twice.
     flip
         Mirror frames at random: right as far as the light source stands near the lens.
     schedule
@@ -182,6 +185,7 @@ class Training:
     batch: int = 4
     crop: tuple[int, ...] = ()
     frames: int = 0
+    noise: str = "recorded"
     flip: bool = False
     schedule: str = "constant"
     validate_every: int = 0
@@ -197,6 +201,7 @@ class Training:
             "float32 or bfloat16",
             self.precision,
         )
+        _require(self.noise in ("recorded", "drawn"), "training.noise", "recorded or drawn", self.noise)
         _require(self.frames >= 0, "training.frames", ">= 0", self.frames)
         _require(
             len(self.crop) in (0, 2) and all(c >= 32 for c in self.crop),

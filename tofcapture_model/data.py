@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,11 @@ from torch.utils.data import Dataset
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
 from tofcapture.files.layout import MaskBit
+from tofcapture.files.packed import PackedScene
+from tofcapture.files.shard import ShardReader
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoder, frequencies
+from tofcapture.ops.phase.float32 import tap_weights
 from tofcapture_model.frame import NO_MAPS, Frame, Target
 from tofcapture_model.multipath import cues
 from tofcapture_model.shards import SampleId, all_samples, open_scenes
@@ -74,6 +77,7 @@ def make_frame(
         cues=torch.empty(0),
         modulation=torch.tensor(frequencies(info.modulation_hz), dtype=torch.float32),
         intrinsics=torch.tensor([camera.pinhole("network input").fx, camera.fy, camera.cx, camera.cy]),
+        demodulation=_tensor(tap_weights(info)[[0, 2, 1, 3]]),
     )
     whole = batched(frame)
     high = frequencies(info.modulation_hz)[1]
@@ -144,6 +148,8 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         Of crops and flips.
     frames
         Use only the first so many frames of every view; 0: all.
+    mean
+        One item per view: the mean of its frames, for noise that is drawn again (:func:`tofcapture_model.augment.redraw_frame`).
     cache_bytes
         Decoded frames are kept in memory up to this size.
     cache
@@ -159,12 +165,14 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         flip: bool = False,
         seed: int = 0,
         frames: int = 0,
+        mean: bool = False,
         cache_bytes: float = 1.5e9,
         cache: Path | None = None,
     ) -> None:
         self.readers = open_scenes(folder, split, cache)
         self.size, self.flip, self.seed, self.cache_bytes = tuple(size), flip, seed, cache_bytes
-        self.samples = all_samples(self.readers, frames)
+        self.samples = all_samples(self.readers, 1 if mean else frames)
+        self.mean, self.averaged = mean, _averaged(self.readers.values(), frames) if mean else 1
         if not self.samples:
             raise DataError(
                 f"{folder}: the split {split} is empty", hint="record more scenes, or choose another --split"
@@ -192,10 +200,11 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         if sample in self._frames:
             return self._frames[sample]
         reader = self.readers[sample.scene]
-        celsius = reader.celsius(sample.view, sample.frame)
+        taken = range(self.averaged) if self.mean else [sample.frame]
+        celsius = float(np.mean([reader.celsius(sample.view, f) for f in taken]))
         if sample.scene not in self._decoders:
             self._decoders[sample.scene] = frame_decoder(reader.info, reader.camera)
-        raw = reader.raw(sample.view, sample.frame)
+        raw: NDArray[Any] = np.stack([reader.raw(sample.view, f) for f in taken]).mean(0, dtype=np.float32)
         frame = make_frame(raw, reader.info, reader.camera, celsius, self._decoders[sample.scene])
         if (len(self._frames) + 1) * sum(x.nbytes for x in frame) < self.cache_bytes:
             self._frames[sample] = frame
@@ -227,6 +236,12 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         """Close the shards."""
         for reader in self.readers.values():
             reader.close()
+
+
+def _averaged(readers: Iterable[ShardReader | PackedScene], frames: int) -> int:
+    """Frames of a view that every scene has, and no more than ``frames`` (0: all)."""
+    least = min(reader.frames for reader in readers)
+    return min(least, frames) if frames else least
 
 
 def collate(items: Sequence[tuple[Frame, Target]]) -> tuple[Frame, Target]:

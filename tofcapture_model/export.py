@@ -53,6 +53,7 @@ def example(batch: int, size: tuple[int, int] = SIZE, seed: int = 0) -> Frame:
         cues=0.005 * noise(4),
         modulation=torch.tensor([[20e6, 100e6]]).repeat(batch, 1),
         intrinsics=camera.repeat(batch, 1),
+        demodulation=torch.zeros(batch, 4, 8),
     )
 
 

@@ -31,6 +31,8 @@ class Frame(NamedTuple):
         (B, 2) low and high modulation frequency, Hz.
     intrinsics
         (B, 4) fx, fy, cx, cy in pixels of the (H, W) grid.
+    demodulation
+        (B, 4, K) weights that turn taps into ``phasor``.
     """
 
     raw: Tensor
@@ -42,9 +44,10 @@ class Frame(NamedTuple):
     cues: Tensor
     modulation: Tensor
     intrinsics: Tensor
+    demodulation: Tensor
 
 
-NO_MAPS = frozenset({"modulation", "intrinsics"})
+NO_MAPS = frozenset({"modulation", "intrinsics", "demodulation"})
 """Fields of a frame that have no pixels: neither cropped nor mirrored."""
 
 

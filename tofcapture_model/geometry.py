@@ -6,13 +6,18 @@ All functions keep the dtype they are given; the project calls them in float32.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
+from tofcapture.rig import SPEED_OF_LIGHT
+from tofcapture_model.frame import Frame
+
 _TINY = 1e-12
+_FAINT = 1e-10  # keeps atan2 differentiable where a pixel is dark
 
 
 def scale_intrinsics(intrinsics: Tensor, s: int) -> Tensor:
@@ -218,3 +223,25 @@ def propagate_depth(
         total = total + weight * torch.where(keep, vote, torch.zeros_like(vote))
         norm = norm + weight
     return total / norm
+
+
+def turn(new: Tensor, old: Tensor) -> Tensor:
+    """(B, 1, H, W) radians in [-pi, pi] from phasor ``old`` to phasor ``new``, each (B, 2, H, W) I and Q."""
+    real = (new * old).sum(1, keepdim=True)
+    imaginary = (new[:, 1] * old[:, 0] - new[:, 0] * old[:, 1])[:, None]
+    return torch.atan2(imaginary, real + torch.where(real < 0, -_FAINT, _FAINT))
+
+
+def turned_depth(frame: Frame, high: Tensor) -> Tensor:
+    """Depth (B, 1, H, W), metres, that the frame would have had with ``high`` (B, 2, H, W) as its phasor of the high frequency.
+
+    The phasor's turn moves the decoded depth along the ray: calibration and unwrapping stay those of the frame.
+    """
+    radial = turn(high, frame.phasor[:, 2:]) * metres_per_radian(frame, 1)
+    length = rays(frame.intrinsics, *frame.depth.shape[-2:]).square().sum(1, keepdim=True).sqrt()
+    return frame.depth + radial / length
+
+
+def metres_per_radian(frame: Frame, which: int) -> Tensor:
+    """(B, 1, 1, 1) range per phase of the low (0) or the high (1) frequency."""
+    return (SPEED_OF_LIGHT / (4 * math.pi)) / frame.modulation[:, which].reshape(-1, 1, 1, 1)

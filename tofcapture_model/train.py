@@ -6,6 +6,7 @@ import hashlib
 import math
 import os
 import time
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from torch.utils.data import DataLoader
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.seal import sha256_of
+from tofcapture_model.augment import redraw_frame
 from tofcapture_model.checkpoint import (
     find_model,
     load_model,
@@ -133,6 +135,7 @@ def train(
             flip=config.training.flip,
             seed=config.training.seed,
             frames=config.training.frames,
+            mean=config.training.noise == "drawn",
             cache_bytes=0 if workers else 1.5e9,
             cache=cache,
         )
@@ -161,6 +164,8 @@ def train(
                     progress = _progress(position, stage, len(batches), budget)
                     rate = _learning_rate(optimizer, stage, config.training.schedule, progress)
                     frame, target = frame_to(frame, place), target_to(target, place)  # noqa: PLW2901
+                    if data.mean:
+                        frame = redraw_frame(frame, _noise(position, config, place), averaged=data.averaged)  # noqa: PLW2901
                     with half:
                         estimate = called(frame, stage.name)
                     estimate = Estimate(*(x.float() for x in estimate))
@@ -212,6 +217,13 @@ def _expect_finite(loss: float, position: Position, out: Path) -> None:
             f"{out}: expected a finite loss, got {loss} at step {position.step + 1}",
             hint="the last resume point is sound: check the dataset (tofcapture check), or lower the learning rate",
         )
+
+
+def _noise(position: Position, config: Config, place: torch.device) -> torch.Generator:
+    """Generator of a step: a resumed run draws what an unbroken one would have."""
+    rank = int(os.environ.get("RANK", "0"))
+    seed = f"{config.training.seed}/{position.stage}/{position.step}/{rank}"
+    return torch.Generator(place).manual_seed(zlib.crc32(seed.encode()))
 
 
 def _begin_with(model: Model, config: Config, start: Path) -> str:

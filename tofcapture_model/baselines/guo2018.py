@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from tofcapture_model.baselines.protocol import Baseline, turned_depth
+from tofcapture_model.baselines.protocol import Baseline
 from tofcapture_model.frame import Estimate, Frame, Target
+from tofcapture_model.geometry import turned_depth
 from tofcapture_model.losses import masked_mean
 from tofcapture_model.unet import pad_to_multiple
 

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
-from tofcapture_model.baselines.protocol import NEAREST, NORMAL_RADIUS, turned_depth
+from tofcapture_model.baselines.protocol import NEAREST, NORMAL_RADIUS
 from tofcapture_model.baselines.sensor import upsample_depth
 from tofcapture_model.frame import Frame
-from tofcapture_model.geometry import depth_to_normals, scale_intrinsics, shifted
+from tofcapture_model.geometry import depth_to_normals, scale_intrinsics, shifted, turned_depth
 
 GAUSSIAN = (0.1070, 0.1131, 0.1070, 0.1131, 0.1196, 0.1131, 0.1070, 0.1131, 0.1070)
 RANGE = 1.442695 * 5.0  # of the phase distance (1 - cos) / 2
