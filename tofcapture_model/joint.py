@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from torch import nn
-from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.config import Network
 from tofcapture_model.frame import Estimate, Frame
 from tofcapture_model.geometry import scale_intrinsics
-from tofcapture_model.networks import CompactInputs, ErrorMap, PaperInputs, Raw2Depth, Raw2Normal
+from tofcapture_model.networks import CompactInputs, ErrorMap, PaperInputs, Raw2Depth, Raw2Normal, doubled
 from tofcapture_model.refine import Refinement
 from tofcapture_model.unet import UNet
 
@@ -54,14 +53,14 @@ class JointModel(nn.Module):
         features = self.inputs(frame)
         shared = self.backbone(features.image)
         if stage == "normal":
-            depth = F.interpolate(frame.depth, scale_factor=2, mode="bilinear", align_corners=False)
+            depth = doubled(frame.depth)
         else:
             depth = self.raw2depth(shared, features, frame)
         error = self.error_map(shared, depth, frame)
         if stage == "depth":
-            normals = F.interpolate(features.normals, scale_factor=2, mode="bilinear", align_corners=False)
+            normals = doubled(features.normals)
         else:
-            normals = self.raw2normal(shared, features)
+            normals = self.raw2normal(shared, features, depth, frame)
         if stage in ("depth", "normal"):
             return Estimate(depth, normals, error, depth, normals)
         fine_depth, fine_normals = self.refinement(

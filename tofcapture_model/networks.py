@@ -14,11 +14,21 @@ from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.config import SOURCES, Network
 from tofcapture_model.frame import Frame
-from tofcapture_model.geometry import plane_normals, rays, side_window_planes, unit
-from tofcapture_model.unet import CONVEX_CHANNELS, UNet, bilinear_logits, convex_upsample
+from tofcapture_model.geometry import local_planes, plane_normals, rays, side_window_planes, unit
+from tofcapture_model.unet import (
+    CONVEX_CHANNELS,
+    UNet,
+    bilinear_logits,
+    convex_upsample,
+    double_conv,
+    he_initialised,
+)
 
 CUE_SCALE = (1.0, 1.0, 0.01, 0.3)  # what one may expect of each cue: most lenses scatter about one percent
 RESIDUAL_UNIT = 0.01  # m; a head's output of 1 moves the depth by a centimetre
+FIT_RADII = (1, 2)  # px of the sensor, of the planes that compact fits to its own depth
+_HEAD_WIDTH = 24
+_HOLE = 1e-3  # weight of a filled pixel
 _PHASOR_FLOOR = 1e-4  # of saturation; below it an amplitude is noise
 
 
@@ -69,7 +79,7 @@ class CompactInputs(nn.Module):
     def forward(self, frame: Frame) -> Features:
         """Compute features; nothing here is learned."""
         r = rays(frame.intrinsics, *frame.depth.shape[-2:])
-        planes = [side_window_planes(frame.depth, frame.valid + 1e-3, w) for w in self.windows]
+        planes = [side_window_planes(frame.depth, frame.valid + _HOLE, w) for w in self.windows]
         smooth = [1 / c[:, :1].clamp_min(1e-2) for c, _ in planes]
         normals = [plane_normals(c, frame.intrinsics) for c, _ in planes]
         channels = [
@@ -155,13 +165,46 @@ class ErrorMap(nn.Module):
 
 
 class Raw2Normal(nn.Module):
-    """Residual on the starting normals, by sub-pixel convolution."""
+    """Residual on the starting normals, by sub-pixel convolution.
+
+    ``compact`` also fits planes to its own depth, in windows of 3 and of 5 pixels, and steps towards their normals by learned
+    gates: depth is denoised first, and normals follow from it where noise let them (depth to normal, as in the paper's IV-C).
+    """
 
     def __init__(self, network: Network, channels: int) -> None:
         super().__init__()
-        self.net = _head(network, channels, 12)
+        self.fits = FIT_RADII if network.kind == "compact" else ()
+        self.net = (
+            _two_layers(channels + 3 * (len(self.fits) + 1), 12 + 4 * len(self.fits))
+            if self.fits
+            else _head(network, channels, 12)
+        )
 
-    def forward(self, shared: Tensor, features: Features) -> Tensor:
-        """Return unit camera-facing normals (B, 3, 2H, 2W)."""
-        start = F.interpolate(features.normals, scale_factor=2, mode="bilinear", align_corners=False)
-        return unit(start + F.pixel_shuffle(self.net(shared).float(), 2))
+    def forward(self, shared: Tensor, features: Features, depth: Tensor, frame: Frame) -> Tensor:
+        """Return unit camera-facing normals (B, 3, 2H, 2W) of a depth (B, 1, 2H, 2W)."""
+        start = doubled(features.normals)
+        if not self.fits:
+            return unit(start + F.pixel_shuffle(self.net(shared).float(), 2))
+        fitted = self._fitted(depth, frame)
+        out = self.net(torch.cat([shared, features.normals, *fitted], dim=1)).float()
+        fine = F.pixel_shuffle(out, 2)
+        residual, gates = fine[:, :3], fine[:, 3:].chunk(len(fitted), dim=1)
+        steps = [g * (doubled(n) - start) for g, n in zip(gates, fitted, strict=True)]
+        return unit(torch.stack([start + residual, *steps]).sum(0))
+
+    def _fitted(self, depth: Tensor, frame: Frame) -> list[Tensor]:
+        coarse = F.avg_pool2d(depth, 2)
+        weight = frame.valid + _HOLE
+        return [plane_normals(local_planes(coarse, weight, r)[0], frame.intrinsics) for r in self.fits]
+
+
+def doubled(image: Tensor) -> Tensor:
+    """Bilinear x2."""
+    return F.interpolate(image, scale_factor=2, mode="bilinear", align_corners=False)
+
+
+def _two_layers(inputs: int, outputs: int) -> nn.Module:
+    """Build two 3 x 3 convolutions and a last one that starts at zero."""
+    net = nn.Sequential(*double_conv(inputs, _HEAD_WIDTH), _zeroed(_HEAD_WIDTH, outputs))
+    net[:-1].apply(he_initialised)
+    return net

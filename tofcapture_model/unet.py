@@ -62,7 +62,7 @@ class UNet(nn.Module):
         self.merge = nn.ModuleList(double_conv(2 * w, w) for w in widths[-2::-1])
         self.last = nn.Conv2d(width, outputs, 1)
         self.multiple = 2 ** (levels - 1)
-        self.apply(_he)
+        self.apply(he_initialised)
         if zero_last:
             nn.init.zeros_(self.last.weight)
             nn.init.zeros_(self.last.bias) if self.last.bias is not None else None
@@ -81,7 +81,8 @@ class UNet(nn.Module):
         return out
 
 
-def _he(module: nn.Module) -> None:
+def he_initialised(module: nn.Module) -> None:
+    """Initialise a convolution for the ReLU behind it (He 2015); for ``Module.apply``."""
     if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
         nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
         if module.bias is not None:
