@@ -21,7 +21,7 @@ from tofcapture_model.config import preset
 from tofcapture_model.data import batched, make_frame
 from tofcapture_model.export import export
 from tofcapture_model.onnx_backend import ask_onnx, open_onnx
-from tofcapture_model.predict import NOMINAL_CAMERA
+from tofcapture_model.raw_input import NOMINAL_CAMERA
 from tofcapture_model.zoo import build_model
 
 

@@ -70,7 +70,7 @@ def wheel(tmp_path_factory):
 
 @pytest.mark.slow
 def test_wheel_holds_the_packages_and_nothing_else(wheel):
-    """Templates, presets, boards and the station are in it; tests, docs and benchmarks are not."""
+    """Templates, presets, weights, boards and the station are in it; tests, docs and benchmarks are not."""
     names = zipfile.ZipFile(wheel).namelist()
     tops = {n.split("/")[0] for n in names}
     assert {t for t in tops if not t.endswith(".dist-info")} == {
@@ -82,6 +82,10 @@ def test_wheel_holds_the_packages_and_nothing_else(wheel):
         p
         for g in ("*.toml", "*.j2", "*.js", "*.css", "*.html", "py.typed")
         for p in (ROOT / "tofcapture").rglob(g)
+    ]
+    shipped += [
+        *(ROOT / "tofcapture_model/weights").iterdir(),
+        *(ROOT / "tofcapture_model/presets").iterdir(),
     ]
     for path in shipped:
         assert str(path.relative_to(ROOT)) in names
@@ -129,6 +133,34 @@ def test_wheel_reads_a_shard_with_numpy_and_h5py_only(tmp_path, wheel):
         assert done.returncode in {3, 5}, done.stderr
         assert "pip install" in done.stderr or done.returncode == 5
         assert len(done.stderr.splitlines()) <= 5
+
+
+@pytest.mark.slow
+def test_installed_wheel_predicts_with_its_own_weights(tmp_path, wheel):
+    """Installed elsewhere, an array and nothing else gives depth: the weights that answer are those of the wheel."""
+    pytest.importorskip("torch")
+    if not (ROOT / "tofcapture_model/weights/model.safetensors").exists():
+        pytest.skip("no weights are bundled in this tree")
+    from tests.test_model_predict import table_top
+    from tofcapture_model.raw_input import NOMINAL_CAMERA
+
+    words = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", tmp_path / "site", wheel]
+    subprocess.run([str(w) for w in words], check=True, capture_output=True)
+    raw, depth = table_top(NOMINAL_CAMERA)
+    np.save(tmp_path / "raw.npy", raw)
+    done = subprocess.run(
+        [sys.executable, "-m", "tofcapture", "predict", "raw.npy", "--out", "out", "--json"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path / "site")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["weights"].startswith(str(tmp_path / "site"))
+    found = np.load(tmp_path / "out" / "depth.npy")
+    assert np.median(np.abs(found - np.kron(depth, np.ones((2, 2))))) < 0.05
+    assert wheel.stat().st_size < 12e6
 
 
 # What goes wrong, from the command line: (make the case, command line, exit code, words that must be said).

@@ -1,17 +1,20 @@
 """Robust Chamfer loss on the image grid (paper eq. 2 with the seven jitter candidates), exact.
 
-The neighbours come from :mod:`tofcapture_model.neighbours` and carry no gradient; the pairs that they make do.
+The neighbours come from :mod:`tofcapture_model.trees` on a CPU with numba, else from :mod:`tofcapture_model.neighbours`. They carry no
+gradient; the pairs that they make do.
 """
 
 from __future__ import annotations
 
 import math
+from types import EllipsisType
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from tofcapture_model.neighbours import Found, nearest, nearest_of_best
+from tofcapture_model import neighbours, trees
+from tofcapture_model.neighbours import Found
 
 JITTER = 0.010  # m, paper: 1 centimetre
 
@@ -108,14 +111,23 @@ def _item(
         nothing = 0.0 * torch.where(p_mask, p, 0.0).sum()
         return nothing, shifts.new_zeros(len(shifts)), torch.zeros((), dtype=torch.int64, device=p.device)
 
-    def directed(found: Found, shift: Tensor) -> Tensor:
-        return _directed(p, q, p_mask, q_mask, found.index, shift.reshape(3, 1, 1), normals)
+    box, corner = _box(p_mask | q_mask)
+    p, q, p_mask, q_mask = p[box], q[box], p_mask[box], q_mask[box]
+    intrinsics, normals = intrinsics - corner.to(intrinsics), None if normals is None else normals[box]
 
-    cloud = p.detach()
+    def directed(found: Found, shift: Tensor) -> Tensor:
+        return _directed(p, q, p_mask, q_mask, found.index, shift[:, None], normals)
+
+    clouds = (p.detach(), q.detach(), p_mask, q_mask)
+    compiled = trees.usable(p.device)
     if softness == 0 and normals is None:
-        k, found, scores = nearest_of_best(cloud, q, p_mask, q_mask, intrinsics, shifts)
+        k, found, scores = (
+            trees.nearest_of_best(*clouds, shifts)
+            if compiled
+            else neighbours.nearest_of_best(*clouds, intrinsics, shifts)
+        )
         return directed(found, shifts[k]), scores, torch.tensor(k, device=p.device)
-    every = nearest(cloud, q, p_mask, q_mask, intrinsics, shifts)
+    every = trees.nearest(*clouds, shifts) if compiled else neighbours.nearest(*clouds, intrinsics, shifts)
     losses = torch.stack([directed(f, s) for f, s in zip(every, shifts, strict=True)])
     winner = losses.argmin()
     soft = (
@@ -126,20 +138,27 @@ def _item(
     return soft, losses.detach(), winner
 
 
-def _gather(points: Tensor, index: Tensor) -> Tensor:
-    """Points (3, N) at flat pixels (N,) of (3, H, W)."""
-    return points.flatten(1)[:, index]
+def _box(mask: Tensor) -> tuple[tuple[EllipsisType, slice, slice], Tensor]:
+    """Window of (..., H, W) that holds a mask (H, W), and what it takes from fx, fy, cx, cy."""
+    rows, cols = mask.any(1).nonzero()[:, 0].tolist(), mask.any(0).nonzero()[:, 0].tolist()
+    window = (..., slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
+    return window, torch.tensor([0.0, 0.0, cols[0], rows[0]])
 
 
 def _directed(
     p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, index: Tensor, shift: Tensor, normals: Tensor | None
 ) -> Tensor:
-    """Symmetric mean squared distance of P + s and Q for given neighbours (2, H, W)."""
-    moved = p + shift
-    to_q, to_p = index[0][p_mask], index[1][q_mask]
-    forward = moved[:, p_mask] - _gather(q, to_q)
-    backward = _gather(moved, to_p) - q[:, q_mask]
+    """Symmetric mean squared distance of P + s and Q for given neighbours (2, H, W).
+
+    The shift (3, 1) is added to differences, where it rounds least.
+    """
+    p, q = p.flatten(1), q.flatten(1)
+    of_p, of_q = (mask.flatten().nonzero()[:, 0] for mask in (p_mask, q_mask))
+    to_q, to_p = index[0].flatten()[of_p], index[1].flatten()[of_q]
+    forward = p.index_select(1, of_p) - q.index_select(1, to_q) + shift
+    backward = p.index_select(1, to_p) - q.index_select(1, of_q) + shift
     if normals is None:
         return forward.square().sum(0).mean() + backward.square().sum(0).mean()
-    forward, backward = (forward * _gather(normals, to_q)).sum(0), (backward * normals[:, q_mask]).sum(0)
+    normals = normals.flatten(1)
+    forward, backward = (forward * normals[:, to_q]).sum(0), (backward * normals[:, of_q]).sum(0)
     return forward.square().mean() + backward.square().mean()

@@ -11,12 +11,12 @@ import os
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from tofcapture.errors import ConfigError, FormatError
+from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture_model.config import Config, dumps_config, loads_config
 from tofcapture_model.zoo import Model, build_model
 
@@ -56,8 +56,32 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         ) from err
 
 
-def save_model(path: Path, model: Model, config: Config, provenance: Mapping[str, Any]) -> Path:
-    """Write weights and configuration; ``provenance`` is any JSON object (dataset digests, steps, metrics)."""
+def save_model(
+    path: Path,
+    model: Model,
+    config: Config,
+    provenance: Mapping[str, Any],
+    *,
+    precision: Literal["float32", "float16"] = "float32",
+) -> Path:
+    """Write weights and configuration.
+
+    Parameters
+    ----------
+    path
+        ``.safetensors``; the configuration is written beside it as ``.toml``.
+    model, config
+        What was trained, and as what.
+    provenance
+        Any JSON object (dataset digests, steps, metrics).
+    precision
+        ``float16`` halves the file and rounds every weight to 11 bits; :func:`load_model` computes in float32 all the same.
+
+    Raises
+    ------
+    DataError
+        A weight that float16 cannot hold.
+    """
     text = dumps_config(config)
     header = {
         "format": FORMAT,
@@ -65,9 +89,19 @@ def save_model(path: Path, model: Model, config: Config, provenance: Mapping[str
         "config": text,
         "provenance": json.dumps(provenance, sort_keys=True),
     }
-    write_tensors(path, model.state_dict(), header)
+    weights = model.state_dict()
+    write_tensors(path, weights if precision == "float32" else _halved(weights), header)
     path.with_suffix(".toml").write_text(text, encoding="utf-8")
     return path
+
+
+def _halved(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Round floats to float16; what it cannot hold is an error."""
+    half = {k: v.half() if v.is_floating_point() else v for k, v in weights.items()}
+    lost = [k for k, v in half.items() if not torch.isfinite(v).all()]
+    if lost:
+        raise DataError(f"{lost[0]}: expected weights within +-65504 for float16", hint="save it in float32")
+    return half
 
 
 def find_model(path: Path | None) -> Path:
@@ -83,7 +117,7 @@ def find_model(path: Path | None) -> Path:
 
 
 def load_model(path: Path | None) -> tuple[Model, Config, dict[str, Any]]:
-    """Load a model, strictly: a missing or an additional weight is an error.
+    """Load a model, strictly: a missing or an additional weight is an error. It computes in float32, however it was stored.
 
     Parameters
     ----------
@@ -112,7 +146,7 @@ def load_model(path: Path | None) -> tuple[Model, Config, dict[str, Any]]:
 
 
 def load_strictly(model: Model, tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Copy tensors into a model; names and shapes must agree exactly."""
+    """Copy tensors into a model, whatever their precision; names and shapes must agree exactly."""
     try:
         model.load_state_dict(dict(tensors), strict=True)
     except RuntimeError as err:

@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,29 +17,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tofcapture.camera import Camera
-from tofcapture.errors import ConfigError, DataError
+from tofcapture.errors import ConfigError
 from tofcapture.files.seal import write_text
-from tofcapture.frames import TofInfo
-from tofcapture.rig import load_rig
 from tofcapture_model.checkpoint import find_model, load_model
-from tofcapture_model.data import batched, make_frame
+from tofcapture_model.data import batched, frame_decoder, make_frame
 from tofcapture_model.frame import Frame, frame_to
+from tofcapture_model.raw_input import RawInput, read_input
 
 Float32 = NDArray[np.float32]
-RUNS = 3  # timed inferences, of which the median is told
-
-NOMINAL_CAMERA = Camera(width=240, height=180, fx=190.6186, fy=200.7526, cx=116.8406, cy=101.4767)
-"""A real 240 x 180 sensor of 20/100 MHz; used for a plain array when no rig is given."""
-
-
-@dataclass(frozen=True)
-class RawInput:
-    """A burst and what is needed to decode it: raw (F, 8, H, W), sensor temperatures (F,), camera, intrinsics."""
-
-    raw: NDArray[Any]
-    celsius: NDArray[np.float64]
-    info: TofInfo
-    camera: Camera
+T = TypeVar("T")
+RUNS = 3  # timed runs, of which the median is told; one before them allocates
 
 
 @dataclass(frozen=True)
@@ -57,7 +44,7 @@ class Prediction:
     inference_ms
         Median time of the network, after loading and decoding.
     decode_ms
-        Time of decoding the raw frame and of the physical cues, once.
+        Median time of decoding the raw frame and of the physical cues, after the camera's tables are built.
     """
 
     depth: Float32
@@ -66,74 +53,6 @@ class Prediction:
     camera: Camera
     inference_ms: float
     decode_ms: float
-
-
-def _from_npy(path: Path, rig_path: Path | None) -> RawInput:
-    try:
-        raw = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as err:
-        raise DataError(f"{path}: cannot read the array: {err}") from err
-    raw = raw[None] if raw.ndim == 3 else raw
-    rig = load_rig(rig_path) if rig_path else None
-    camera = rig.tof if rig else NOMINAL_CAMERA
-    if raw.ndim != 4 or raw.shape[1:] != (8, *camera.shape) or len(raw) == 0 or raw.dtype.kind not in "uif":
-        expected = f"(8, {camera.height}, {camera.width}) or (F, 8, {camera.height}, {camera.width})"
-        raise DataError(
-            f"{path}: expected numbers of shape {expected}, got {raw.dtype} {raw.shape}",
-            hint="--rig names a camera of another size",
-        )
-    info = TofInfo(
-        model="array",
-        serial="",
-        camera=camera,
-        illuminator=rig.illuminator if rig else np.zeros(3),
-        range_errors=rig.range_errors if rig else (),
-    )
-    return RawInput(raw, np.full(len(raw), np.nan), info, camera)
-
-
-def _from_h5(path: Path, view: int) -> RawInput:
-    import h5py
-
-    from tofcapture.files.shard import ShardReader
-    from tofcapture.files.view import read_view
-
-    try:
-        with h5py.File(path, "r") as file:
-            kind = str(file.attrs.get("format", ""))
-    except OSError as err:
-        raise DataError(f"{path}: cannot read the file: {err}", hint=f"tofcapture check {path}") from err
-    if kind != "tofcapture-shard":
-        found = read_view(path)
-        return RawInput(found.tof.raw, found.tof.celsius, found.tof.info, found.rig.tof)
-    with ShardReader(path) as shard:
-        if not 0 <= view < shard.views:
-            raise ConfigError(f"{path}: expected a view of 0 to {shard.views - 1}, got {view}")
-        raw = np.stack([shard.raw(view, f) for f in range(shard.frames)])
-        celsius = np.array([shard.celsius(view, f) for f in range(shard.frames)])
-        return RawInput(raw, celsius, shard.info, shard.camera)
-
-
-def read_input(path: Path, view: int = 0, rig: Path | None = None) -> RawInput:
-    """Read a burst.
-
-    Parameters
-    ----------
-    path
-        View file or shard (``.h5``), or an array (8, H, W) or (F, 8, H, W) (``.npy``).
-    view
-        Of a shard.
-    rig
-        ``rig.toml`` for an array; without it, nominal intrinsics and no range correction.
-
-    Raises
-    ------
-    DataError
-        Missing, damaged, or of a wrong shape.
-    """
-    if not path.exists():
-        raise DataError(f"{path}: no such file")
-    return _from_npy(path, rig) if path.suffix == ".npy" else _from_h5(path, view)
 
 
 def predict_raw(
@@ -159,26 +78,32 @@ def predict_raw(
     taken = slice(None) if frame is None else slice(frame, frame + 1)
     raw, celsius = data.raw[taken].mean(axis=0, dtype=np.float64), float(data.celsius[taken].mean())
     ask = _onnx_model(weights, data.camera) if backend == "onnx" else _torch_model(weights, device)
-    started = time.perf_counter()
-    inputs = frame_to(batched(make_frame(raw, data.info, data.camera, celsius)), torch.device(device))
-    decode_ms = 1000 * (time.perf_counter() - started)
-    times: list[float] = []
+    decoder = frame_decoder(data.info, data.camera)
+    wait: Callable[[], None] = torch.cuda.synchronize if device.startswith("cuda") else lambda: None
     with torch.inference_mode():
-        depth, normals, error = ask(inputs)  # the first run allocates
-        for _ in range(RUNS):
-            started = time.perf_counter()
-            depth, normals, error = ask(inputs)
-            if device.startswith("cuda"):
-                torch.cuda.synchronize()
-            times.append(1000 * (time.perf_counter() - started))
+        decoded, decode_ms = _timed(lambda: make_frame(raw, data.info, data.camera, celsius, decoder), wait)
+        inputs = frame_to(batched(decoded), torch.device(device))
+        (depth, normals, error), inference_ms = _timed(lambda: ask(inputs), wait)
     return Prediction(
         depth=depth[0, 0].cpu().numpy(),
         error=error[0, 0].cpu().numpy(),
         normals=np.ascontiguousarray(normals[0].permute(1, 2, 0).cpu().numpy()),
         camera=data.camera.scaled(2),
-        inference_ms=statistics.median(times),
+        inference_ms=inference_ms,
         decode_ms=decode_ms,
     )
+
+
+def _timed(work: Callable[[], T], wait: Callable[[], None]) -> tuple[T, float]:
+    """Answer of some work and its median time in milliseconds."""
+    answer, times = work(), []
+    wait()
+    for _ in range(RUNS):
+        started = time.perf_counter()
+        answer = work()
+        wait()
+        times.append(1000 * (time.perf_counter() - started))
+    return answer, statistics.median(times)
 
 
 Ask = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
@@ -199,7 +124,9 @@ def _onnx_model(weights: Path | None, camera: Camera) -> Ask:
 
     path = find_model(weights).with_suffix(".onnx")
     if not path.exists():
-        raise ConfigError(f"{path}: no such file", hint="tofcapture export --weights ... writes it")
+        raise ConfigError(
+            f"{path}: no such file", hint="tofcapture export --out DIR/model.onnx, then predict --weights DIR"
+        )
     session = open_onnx(path)
     size = tuple(session.get_inputs()[0].shape[-2:])
     if size != camera.shape:
@@ -280,9 +207,10 @@ def predict(
     data = read_input(Path(path), view, rig)
     prediction = predict_raw(data, frame, weights, device, backend)
     written = write_prediction(prediction, Path(out))
+    used = find_model(weights)
     return {
         "input": str(path),
-        "weights": str(find_model(weights)),
+        "weights": str(used.with_suffix(".onnx") if backend == "onnx" else used),
         "inference_ms": round(prediction.inference_ms, 2),
         "decode_ms": round(prediction.decode_ms, 2),
         "shape": list(prediction.depth.shape),

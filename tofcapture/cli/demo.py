@@ -7,10 +7,11 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from tofcapture.cli.weights import bundled_path
 from tofcapture.command import Command, Outcome
 
 SCENES = ("random-8", "random-15", "bottle")
@@ -24,6 +25,11 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder to fill (default demo-out)"
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the simulated station (default 0)")
+    parser.add_argument(
+        "--train",
+        action="store_true",
+        help=f"train a small network for {TRAINING_MINUTES} minutes instead of taking the bundled one",
+    )
 
 
 def _say(text: str) -> None:
@@ -67,59 +73,70 @@ class _Steps:
 def _run(args: argparse.Namespace) -> Outcome:
     out: Path = args.out
     recording, dataset, checked = out / "recording", out / "dataset", out / "dataset-true-rig"
-    model, results, report = out / "model", out / "results.json", out / "report.html"
+    results, report = out / "results.json", out / "report.html"
     out.mkdir(parents=True, exist_ok=True)
+    trains = args.train or bundled_path() is None
+    if trains and not args.train:
+        _say(f"no trained network comes with this installation: training one for {TRAINING_MINUTES} minutes")
     steps = _Steps()
-    seed = ("--seed", args.seed)
-    steps.run(
-        "record the board with holes",
-        "record",
-        "--calibration",
-        "--views",
-        BOARD_VIEWS,
-        "--out",
-        recording,
-        *seed,
-    )
-    recorded = 0
-    for scene in SCENES:
-        steps.run(
-            f"record {scene}", "record", "--scene", scene, "--views", SCENE_VIEWS, "--out", recording, *seed
-        )
-        recorded += len(list((recording / "views" / scene).glob("view-*.h5")))
+    recorded = _record(steps, recording, args.seed)
     aligned = steps.run("align the two cameras", "align", recording)
     built = steps.run("build the shards", "build-dataset", recording, "--out", dataset)
     true = steps.run(
         "build once more with the true rig", "build-dataset", recording, "--out", checked, "--true-rig"
     )
-    steps.run(
-        "train a small network",
-        "train",
-        dataset,
-        "--out",
-        model,
-        "--preset",
-        "demo",
-        "--minutes",
-        TRAINING_MINUTES,
-    )
-    steps.run("evaluate on the held-out scene", "evaluate", dataset, "--weights", model, "--out", results)
-    table = json.loads(results.read_text(encoding="utf-8"))["methods"]
+    weights = _train(steps, dataset, out / "model") if trains else ()
+    tables = _evaluate(steps, dataset, results, weights, every=not trains)
+    view = recording / "views" / SCENES[-1] / "view-000.h5"
+    steps.run("predict one frame", "predict", view, *weights, "--out", out / "prediction")
     steps.run(
         "write the report",
         *("report", "--dataset", dataset, "--results", results, "--evidence", recording / "evidence.json"),
-        *("--weights", model, "--out", report),
+        *(*weights, "--out", report),
     )
     data = {
         "views": recorded,
         "align": {k: aligned[k] for k in ("rotation_error_deg", "translation_error_mm")},
         "gt": true["gt"],
         "gt_aligned": built["gt"],
-        **{name: _row(table[name]) for name in ("sensor", "model")},
+        "network": "trained" if trains else "bundled",
+        **next(iter(tables.values())),
+        "scenes": tables,
         "report": str(report),
+        "prediction": str(out / "prediction"),
         "seconds": {**steps.seconds, "total": round(time.perf_counter() - steps.started, 1)},
     }
-    return Outcome(data=data, text=_text(data, recording, dataset, model))
+    return Outcome(data=data, text=_text(data, out))
+
+
+def _record(steps: _Steps, recording: Path, seed: int) -> int:
+    """Record the board and all scenes; returns the views of the scenes."""
+    to = ("--out", recording, "--seed", seed)
+    steps.run("record the board with holes", "record", "--calibration", "--views", BOARD_VIEWS, *to)
+    for scene in SCENES:
+        steps.run(f"record {scene}", "record", "--scene", scene, "--views", SCENE_VIEWS, *to)
+    return sum(len(list((recording / "views" / scene).glob("view-*.h5"))) for scene in SCENES)
+
+
+def _train(steps: _Steps, dataset: Path, model: Path) -> tuple[object, ...]:
+    how = ("--preset", "demo", "--minutes", TRAINING_MINUTES)
+    steps.run("train a small network", "train", dataset, "--out", model, *how)
+    return "--weights", model
+
+
+def _evaluate(
+    steps: _Steps, dataset: Path, results: Path, weights: tuple[object, ...], *, every: bool
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Sensor and network by scenes; with ``every`` also on the split that a network trained here would have seen."""
+    splits = {"test": ("evaluate on the held-out scene", results)}
+    if every:
+        splits["train"] = ("evaluate on the other scenes", results.with_name("results-other-scenes.json"))
+    out = {}
+    for split, (title, path) in splits.items():
+        steps.run(title, "evaluate", dataset, *weights, "--split", split, "--out", path)
+        table = json.loads(path.read_text(encoding="utf-8"))
+        out[", ".join(table["scenes"])] = {name: _row(m) for name, m in table["methods"].items()}
+    return out
 
 
 def _row(method: dict[str, Any]) -> dict[str, float]:
@@ -132,13 +149,18 @@ def _row(method: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def _text(data: dict[str, Any], recording: Path, dataset: Path, model: Path) -> str:
+_COLUMNS = ("mae_mm", "rmse_mm", "median_mm", "normal_mean_deg")
+_NAMES = {"bundled": "bundled network", "trained": "small network"}
+
+
+def _text(data: Mapping[str, Any], out: Path) -> str:
     number: Callable[[float], str] = "{:9.2f}".format
-    rows = [
-        f"  {name:<24}"
-        + "".join(number(data[key][k]) for k in ("mae_mm", "rmse_mm", "median_mm", "normal_mean_deg"))
-        for name, key in (("ToF sensor", "sensor"), ("small network", "model"))
-    ]
+    names = {"sensor": "ToF sensor", "model": _NAMES[data["network"]]}
+    rows = [f"  {'':<24}   MAE mm  RMSE mm median mm  normal deg"]
+    for scenes, table in data["scenes"].items():
+        rows.append(f"  {scenes}")
+        for key, name in names.items():
+            rows.append(f"    {name:<22}" + "".join(number(table[key][k]) for k in _COLUMNS))
     return "\n".join(
         [
             "",
@@ -146,20 +168,35 @@ def _text(data: dict[str, Any], recording: Path, dataset: Path, model: Path) -> 
             f"ground truth with the true rig: median {data['gt']['median_error_mm']:.2f} mm, 99 % within {data['gt']['p99_error_mm']:.2f} mm",
             f"ground truth with the rig as aligned: median {data['gt_aligned']['median_error_mm']:.2f} mm",
             "",
-            "  held-out scene           MAE mm  RMSE mm median mm  normal deg",
             *rows,
             "",
             f"report: {data['report']}   ({data['seconds']['total'] / 60:.1f} minutes in all)",
-            f"This network is small and saw two simulated scenes for {TRAINING_MINUTES} minutes; it shows the way, not the limit. Next:",
-            f"  tofcapture record --scene bottle --views 25 --out {recording}",
-            f"  tofcapture build-dataset {recording} --out {dataset}",
-            f"  tofcapture train {dataset} --out {model}-compact --preset compact",
+            f"points: {data['prediction']}/cloud.ply   depth, normals and pictures beside it",
+            *_next(data["network"], out),
         ]
     )
 
 
+def _next(network: str, out: Path) -> list[str]:
+    record = f"  tofcapture record --scene mug --views 25 --out {out / 'recording'}"
+    build = f"  tofcapture build-dataset {out / 'recording'} --out {out / 'dataset'}"
+    if network == "bundled":
+        return [
+            "The bundled network was trained on other simulated scenes and has seen no real frame. Next:",
+            record,
+            f"  tofcapture predict {out / 'recording'}/views/mug/view-000.h5 --out mug",
+            f"  tofcapture train {out / 'dataset'} --from bundled --out {out / 'fine-tuned'}",
+        ]
+    return [
+        f"This network is small and saw two simulated scenes for {TRAINING_MINUTES} minutes; it shows the way, not the limit. Next:",
+        record,
+        build,
+        f"  tofcapture train {out / 'dataset'} --out {out / 'model-compact'} --preset compact",
+    ]
+
+
 COMMAND = Command(
-    help="the whole way on the simulated station: record, align, build, train, evaluate, report (under 10 minutes)",
+    help="the whole way on the simulated station: record, align, build, evaluate, predict, report; --train trains a network too",
     example="tofcapture demo --out demo-out",
     configure=_configure,
     run=_run,

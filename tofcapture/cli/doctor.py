@@ -19,8 +19,9 @@ from pathlib import Path
 
 from tofcapture.cli.config import station_path
 from tofcapture.cli.doctor_probe import Finding, probe
+from tofcapture.cli.weights import bundled_path, describe_weights
 from tofcapture.command import Command, Outcome
-from tofcapture.errors import ConfigError, TofError
+from tofcapture.errors import ConfigError, FormatError, TofError
 
 _ORDER = ("FAIL", "WARN", "PASS")
 Check = Callable[[], list[Finding]]
@@ -159,6 +160,19 @@ def check_sqlite() -> list[Finding]:
     ]
 
 
+def check_weights() -> list[Finding]:
+    """The trained network that predict, evaluate and demo take when none is named."""
+    path = bundled_path()
+    if path is None:
+        return [Finding("weights", "WARN", "no trained network is bundled", "name one with --weights")]
+    try:
+        found = describe_weights(path)
+    except FormatError as err:
+        return [Finding("weights", "WARN", err.message, err.hint)]
+    text = f"bundled: {found.kind}, {found.weights / 1e6:.2f} million weights, {found.size / 1e6:.1f} MB"
+    return [Finding("weights", "PASS", text)]
+
+
 def machine_checks(folder: Path) -> list[Check]:
     """Checks of this machine, in this process."""
     from tofcapture.cli import doctor_machine as machine
@@ -172,7 +186,14 @@ def machine_checks(folder: Path) -> list[Check]:
     ]
 
 
-CHECKS: tuple[Check, ...] = (check_python, check_libraries, check_opencv, check_torch, check_sqlite)
+CHECKS: tuple[Check, ...] = (
+    check_python,
+    check_libraries,
+    check_opencv,
+    check_torch,
+    check_sqlite,
+    check_weights,
+)
 
 PROBES: tuple[Check, ...] = (
     lambda: probe("open3d"),

@@ -1,0 +1,207 @@
+"""Predicting: what it starts from, the bundled weights, half precision, and answers to arrays that cannot be right."""
+
+# ruff: noqa: E402  torch is optional
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from tofcapture.camera import Camera
+from tofcapture.cli import main
+from tofcapture.cli.weights import bundled_path
+from tofcapture.errors import ConfigError, DataError
+from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD
+from tofcapture.ops.phase import taps
+from tofcapture.rig import SPEED_OF_LIGHT, Rig, dumps_rig
+from tofcapture_model import checkpoint
+from tofcapture_model import predict as predicting
+from tofcapture_model.checkpoint import find_model, load_model, save_model
+from tofcapture_model.config import preset
+from tofcapture_model.predict import predict, predict_raw
+from tofcapture_model.raw_input import NOMINAL_CAMERA, read_input
+from tofcapture_model.zoo import build_model
+
+ORDER = ("right", "blocks swapped", "interleaved", "reversed", "low reversed", "pairs")
+CHANNELS = (
+    (0, 1, 2, 3, 4, 5, 6, 7),
+    (4, 5, 6, 7, 0, 1, 2, 3),
+    (0, 4, 1, 5, 2, 6, 3, 7),
+    (0, 3, 2, 1, 4, 7, 6, 5),
+    (0, 3, 2, 1, 4, 5, 6, 7),
+    (0, 2, 1, 3, 4, 6, 5, 7),
+)
+
+
+def table_top(camera, seed=0):
+    """(8, H, W) uint16 counts of a slanted table with a block on it, and its depth."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[-1 : 1 : camera.height * 1j, -1 : 1 : camera.width * 1j]
+    depth = 0.7 + 0.15 * v - 0.12 * ((np.abs(u) < 0.4) & (np.abs(v) < 0.3))
+    radial = depth * camera.ray_lengths
+    strength = 400 * (0.4 + 0.2 * np.sign(np.sin(9 * u))) / radial**2
+    hz = (20e6, 100e6)
+    phasor = np.stack([strength * np.exp(4j * np.pi * f * radial / SPEED_OF_LIGHT) for f in hz])
+    clean = taps(phasor, 1.3 * np.abs(phasor) + 60, PAPER_MODULATION_HZ, PAPER_PHASE_RAD)
+    return np.clip(np.rint(rng.normal(clean, 5)), 0, 4095).astype(np.uint16), depth
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """An untrained small network in half precision: it answers as the sensor does."""
+    config = replace(preset("demo"), network=replace(preset("demo").network, width=4, levels=2))
+    folder = tmp_path_factory.mktemp("package") / "weights"
+    torch.manual_seed(0)
+    return save_model(
+        folder / "model.safetensors", build_model(config), config, {"steps": 0}, precision="float16"
+    )
+
+
+@pytest.fixture
+def bundled(weights, monkeypatch):
+    """The same as if it came with the installation."""
+    monkeypatch.setattr(checkpoint, "files", lambda _: weights.parents[1])
+    return weights
+
+
+def saved(path, array):
+    np.save(path, array)
+    return path
+
+
+def test_half_precision_is_half_the_file_and_computes_in_single(weights, tmp_path):
+    """Weights come back as float32, rounded to 11 bits; what float16 cannot hold is refused."""
+    model, config, provenance = load_model(weights)
+    assert provenance == {"steps": 0}
+    assert {p.dtype for p in model.parameters()} == {torch.float32}
+    whole = save_model(tmp_path / "model.safetensors", model, config, provenance)
+    half, full = (sum(t.nbytes for t in checkpoint.read_tensors(p)[0].values()) for p in (weights, whole))
+    assert full == 2 * half
+    for a, b in zip(load_model(whole)[0].state_dict().values(), model.state_dict().values(), strict=True):
+        assert torch.equal(a, b)
+    with torch.no_grad():
+        next(model.parameters()).fill_(1e5)
+    with pytest.raises(DataError, match="65504"):
+        save_model(tmp_path / "large.safetensors", model, config, {}, precision="float16")
+    assert not (tmp_path / "large.safetensors").exists()
+
+
+def test_an_array_and_nothing_else_is_enough(bundled, tmp_path, capsys):
+    """Without --weights the bundled network answers; an untrained one gives the sensor's depth; the mean of a burst is quieter."""
+    burst = np.stack([table_top(NOMINAL_CAMERA, seed)[0] for seed in range(4)])
+    depth = np.kron(table_top(NOMINAL_CAMERA)[1], np.ones((2, 2)))
+    path, errors = saved(tmp_path / "raw.npy", burst), []
+    for flag in ([], ["--average"]):
+        assert main(["predict", str(path), "--out", str(tmp_path / "out"), *flag, "--json"]) == 0
+        answer = json.loads(capsys.readouterr().out)
+        assert answer["weights"] == str(bundled)
+        assert answer["shape"] == [360, 480]
+        assert min(answer["inference_ms"], answer["decode_ms"]) > 0
+        errors.append(np.abs(np.load(tmp_path / "out/depth.npy") - depth).mean())
+    assert errors[1] < errors[0] < 0.01
+    assert {p.name for p in (tmp_path / "out").iterdir()} >= {"cloud.ply", "depth.png", "normals.png"}
+
+
+def test_no_bundled_weights_is_an_error_that_names_the_option(tmp_path, monkeypatch):
+    """An installation without weights says what to do."""
+    monkeypatch.setattr(checkpoint, "files", lambda _: tmp_path)
+    with pytest.raises(ConfigError, match="no weights are bundled") as error:
+        find_model(None)
+    assert "--weights" in error.value.hint
+
+
+@pytest.mark.parametrize("size", [(67, 51), (160, 120)])
+def test_a_camera_of_another_size_is_named_by_its_rig(size, weights, tmp_path):
+    """Odd sizes too: the answer is twice as large and lies on the rig's rays; without the rig the shape is refused."""
+    width, height = size
+    camera = Camera(width, height, width * 0.8, width * 0.8, (width - 1) / 2, (height - 1) / 2)
+    raw, depth = table_top(camera)
+    path = saved(tmp_path / "raw.npy", raw)
+    with pytest.raises(DataError, match="expected numbers of shape") as error:
+        predict(path, tmp_path / "out", weights=weights)
+    assert "--rig" in error.value.hint
+    rig = tmp_path / "rig.toml"
+    rig.write_text(dumps_rig(Rig(camera, Camera(10, 8, 10, 10, 4.5, 3.5), np.eye(4), np.eye(4))))
+    result = predict(path, tmp_path / "out", weights=weights, rig=rig)
+    assert result["shape"] == [2 * height, 2 * width]
+    found = np.load(tmp_path / "out/depth.npy")
+    assert np.median(np.abs(found - np.kron(depth, np.ones((2, 2))))) < 0.01
+
+
+def test_tables_are_built_before_the_clock_starts(weights, tmp_path, monkeypatch):
+    """No frame is decoded with tables of its own: what is timed is what a running camera pays."""
+    real, given = predicting.make_frame, []
+
+    def watched(raw, info, camera, celsius, decoder):
+        given.append(decoder)
+        return real(raw, info, camera, celsius, decoder)
+
+    monkeypatch.setattr(predicting, "make_frame", watched)
+    data = read_input(saved(tmp_path / "raw.npy", table_top(NOMINAL_CAMERA)[0]))
+    predict_raw(data, 0, weights)
+    assert len(given) == predicting.RUNS + 1
+    assert len({id(d) for d in given}) == 1
+
+
+@pytest.mark.parametrize("order", range(len(ORDER)), ids=ORDER)
+def test_channels_in_another_order_are_refused(order, tmp_path):
+    """Wrong orders are told from right ones by physics alone, and the message says which command finds the right one."""
+    path = saved(tmp_path / "raw.npy", table_top(NOMINAL_CAMERA)[0][list(CHANNELS[order])])
+    if order == 0:
+        assert read_input(path).raw.shape == (1, 8, 180, 240)
+        return
+    with pytest.raises(DataError, match="expected channels: 20 MHz at 0, 90, 180, 270 deg") as error:
+        read_input(path)
+    assert "calibrate phase-order" in error.value.hint
+
+
+NOT_COUNTS = {
+    "scaled to 1": (lambda raw: raw / 4095, "values up to 0", "multiply"),
+    "16 bits": (lambda raw: raw * 60.0, "at or beyond", "12"),
+    "8 bits": (lambda raw: (raw / 16).astype(np.uint8), "uint8", "uint16"),
+    "not finite": (lambda raw: np.where(raw > 300, np.nan, raw), "finite", ""),
+    "no light": (lambda raw: np.full_like(raw, 70), "no modulated light", ""),
+    "channels last": (lambda raw: np.moveaxis(raw, 0, -1), "expected numbers of shape", "moveaxis"),
+    "transposed": (lambda raw: raw.swapaxes(1, 2), "expected numbers of shape", "swapaxes"),
+    "no frames": (lambda raw: raw[None][:0], "expected numbers of shape", ""),
+    "text": (lambda raw: raw.astype(str), "expected numbers of shape", ""),
+}
+
+
+@pytest.mark.parametrize("case", sorted(NOT_COUNTS))
+def test_arrays_that_are_no_counts_are_refused(case, tmp_path):
+    """Wrong units and layouts are named with what would put them right."""
+    change, words, hint = NOT_COUNTS[case]
+    path = saved(tmp_path / "raw.npy", change(table_top(NOMINAL_CAMERA)[0]))
+    with pytest.raises(DataError, match=words) as error:
+        read_input(path)
+    assert hint in error.value.hint
+
+
+def test_files_of_another_kind_are_refused(tmp_path):
+    """Folders, other formats, and a rig for a file that carries its own."""
+    (tmp_path / "raw.txt").write_text("1 2 3")
+    for path, words in ((tmp_path, "a folder"), (tmp_path / "raw.txt", "cannot read the file")):
+        with pytest.raises(DataError, match=words) as error:
+            read_input(path)
+        assert ".npy" in error.value.hint
+    (tmp_path / "view.h5").touch()
+    with pytest.raises(ConfigError, match=r"--rig .*expected an array"):
+        read_input(tmp_path / "view.h5", rig=tmp_path / "rig.toml")
+
+
+@pytest.mark.skipif(bundled_path() is None, reason="no weights are bundled in this tree")
+def test_what_is_bundled_loads_and_answers(tmp_path):
+    """The file in the package fits the code: finite depth, unit normals, positive errors, whatever their values."""
+    path = saved(tmp_path / "raw.npy", table_top(NOMINAL_CAMERA)[0])
+    predict(path, tmp_path / "out")
+    depth, normals, error = (np.load(tmp_path / f"out/{n}.npy") for n in ("depth", "normals", "error"))
+    assert np.isfinite(depth).all()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-4)
+    assert (error > 0).all()
+    assert find_model(None) == bundled_path()
+    assert (find_model(None).parent / "MODEL_CARD.md").is_file()
