@@ -237,7 +237,9 @@ def _configure_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weights", type=Path, help="checkpoint or folder of a run (default: the bundled weights)"
     )
-    parser.add_argument("--out", type=Path, help="default: beside the weights, .onnx or .pt2")
+    parser.add_argument(
+        "--out", type=Path, help="default: beside the weights, or here for the bundled ones, .onnx or .pt2"
+    )
     parser.add_argument(
         "--format", choices=("onnx", "torch"), default="onnx", help="torch: torch.export (default: onnx)"
     )
@@ -256,7 +258,10 @@ def _export(args: argparse.Namespace) -> Outcome:
     from tofcapture_model.checkpoint import find_model
     from tofcapture_model.export import export
 
-    out = args.out or find_model(args.weights).with_suffix(".onnx" if args.format == "onnx" else ".pt2")
+    beside = (
+        find_model(args.weights) if args.weights else Path("model")
+    )  # the bundled weights are no place to write to
+    out = args.out or beside.with_suffix(".onnx" if args.format == "onnx" else ".pt2")
     result = export(args.weights, out, kind=args.format, size=(args.size[0], args.size[1]))
     worst = max(result["differences"].values())
     return Outcome(

@@ -173,7 +173,7 @@ class Training:
     schedule
         ``constant`` (paper) or ``cosine`` down to zero over each stage.
     validate_every
-        Epochs between validations; 0: only at the end of each stage.
+        Epochs between validations, and one at the end of each stage; 0: none.
     precision
         ``float32``, or ``bfloat16`` for the convolutions; geometry and losses stay in float32. For GPUs with tensor cores.
     compile

@@ -213,7 +213,11 @@ def doubts(sources: Sources) -> list[str]:
         out.append("The pictures are made with other weights than the table.")
     trained_on = network.provenance.get("manifest_sha256") if network else None
     if trained_on and sources.manifest_sha256 and trained_on != sources.manifest_sha256:
-        out.append("The network was trained on another dataset, or on another state of this one.")
+        out.append(
+            "The network is the bundled one: it was trained on other, simulated scenes."
+            if network and network.bundled
+            else "The network was trained on another dataset, or on another state of this one."
+        )
     if results and sources.manifest and "scenes" in results:
         scenes = sorted(sources.manifest.split(str(results["split"])))
         if scenes != sorted(results["scenes"]):

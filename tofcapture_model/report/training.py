@@ -33,6 +33,8 @@ class Network:
         Number of weights.
     rows
         Lines of ``metrics.jsonl``; empty where there is none.
+    bundled
+        Whether it came with the installation.
     """
 
     model: Model
@@ -42,6 +44,7 @@ class Network:
     sha256: str
     parameters: int
     rows: list[dict[str, Any]]
+    bundled: bool = False
 
     @property
     def config_text(self) -> str:
@@ -80,7 +83,7 @@ def load_network(weights: Path | None) -> tuple[Network | None, str]:
     model, config, provenance = load_model(path)
     count = sum(p.numel() for p in model.parameters())
     rows = read_metrics(path.parent / "metrics.jsonl")
-    return Network(model, config, provenance, path.name, sha256_of(path), count, rows), ""
+    return Network(model, config, provenance, path.name, sha256_of(path), count, rows, weights is None), ""
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
