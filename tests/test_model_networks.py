@@ -131,6 +131,21 @@ def test_the_paper_s_networks_read_the_inputs_of_the_ablation():
     assert JointModel(TINY_PAPER).inputs.channels == 10
 
 
+@pytest.mark.parametrize(
+    ("inputs", "sees"), [(("raw",), False), (("confidence",), False), (("raw", "depth"), True)]
+)
+def test_rows_without_depth_do_not_see_it(inputs, sees):
+    """Another decoded depth changes the answer of a network that reads it, and nothing of one that does not."""
+    torch.manual_seed(0)
+    model = JointModel(replace(TINY_PAPER, inputs=inputs)).eval()
+    for part in (model.raw2depth, model.error_map, model.raw2normal):
+        torch.nn.init.normal_(part.net.last.weight, std=0.05)
+    one = frame()
+    with torch.no_grad():
+        a, b = model(one), model(one._replace(depth=one.depth + 0.1))
+    assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True)) != sees
+
+
 def test_sensor_upsampling_is_bilinear_on_surfaces_and_nearest_at_jumps():
     """No point in the air arises between foreground and background."""
     depth = 0.8 + 0.001 * torch.arange(8.0).reshape(1, 1, 1, 8).expand(1, 1, 6, 8)

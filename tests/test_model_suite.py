@@ -3,6 +3,8 @@
 # ruff: noqa: E402  torch is optional
 from __future__ import annotations
 
+import argparse
+import importlib.util
 import json
 import subprocess
 import sys
@@ -19,13 +21,16 @@ from tests.test_model_networks import frame
 from tests.test_model_training import make_dataset
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError
+from tofcapture.files.cache import pack
+from tofcapture.files.seal import sha256_of
 from tofcapture_model.checkpoint import load_model
-from tofcapture_model.config import Losses, Stage, preset
+from tofcapture_model.config import Losses, Stage, preset, presets
 from tofcapture_model.losses import error_map_loss, laplace_loss, reweighting
 from tofcapture_model.measures import Precision, Uncertainty, regions
 from tofcapture_model.predict import predict
+from tofcapture_model.run_card import budget, closest_preset, trained_minutes
 from tofcapture_model.suite import averaged, read_weights
-from tofcapture_model.tables import SUITES
+from tofcapture_model.tables import SUITES, cells
 from tofcapture_model.train import train
 from tofcapture_model.zoo import build_model, training_loss
 
@@ -50,7 +55,9 @@ def runs(dataset, tmp_path_factory):
     """Two runs of demo and one of coarse-fine."""
     out = tmp_path_factory.mktemp("runs")
     for name, seed in (("demo", 0), ("demo", 1), ("coarse-fine", 0)):
-        train(tiny(name, seed), dataset, out / f"{name}-{seed}")
+        config = tiny(name, seed)
+        config = replace(config, training=replace(config.training, validate_every=1))
+        train(config, dataset, out / f"{name}-{seed}")
     return out
 
 
@@ -87,6 +94,75 @@ def test_a_suite_writes_its_tables_and_every_number(dataset, runs, tmp_path, cap
     assert r"\begin{tabular}" in (tmp_path / "tables.tex").read_text()
     assert "<table>" in (tmp_path / "tables.html").read_text()
     assert json.loads(capsys.readouterr().out)["suite"] == "all"
+
+
+def test_rows_have_the_paper_s_names_in_its_order_and_tell_their_budget():
+    """Table III from results in any order: the paper's words, no row that it does not know, minutes and steps unmarked."""
+    row = {"depth": {"pixel": {"mae": 0.002}}, "budget": {"minutes": 60.0, "steps": 1234}}
+    better = {**row, "depth": {"pixel": {"mae": 0.001}}}
+    results = {
+        "methods": {"paper": better, "mine": row, "without-chamfer": row, "sensor": {}, "inputs-raw": row}
+    }
+    table = cells(results, SUITES["ablation"])
+    assert [name for name, _ in table] == [
+        "ToF sensor",
+        "w/o multi-input",
+        "w/o Chamfer loss",
+        "Ours (full model)",
+    ]
+    assert table[-1][1][3:] == [("1.00", True), ("–", False), ("–", False), ("60.0", False), ("1234", False)]
+    assert [name for name, _ in cells(results, SUITES["main"])][-1] == "mine"
+
+
+def test_recipes_are_the_rows_of_the_tables():
+    """Every run that benchmarks/tables.py trains has a row, every row a run; all train on equal terms but for network and loss."""
+    spec = importlib.util.spec_from_file_location(
+        "tables", Path(__file__).parents[1] / "benchmarks" / "tables.py"
+    )
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    recipes = script.recipes()
+    for suite in ("ablation", "inputs"):
+        assert {*recipes[suite], "sensor"} == SUITES[suite].rows.keys()
+    assert recipes["main"].keys() - {"compact"} <= SUITES["main"].rows.keys()
+    args = argparse.Namespace(width=8, crop=0, rate=0.0, precision="bfloat16")
+    equal = {script.on_equal_terms(c, args, 1).training for suite in recipes.values() for c in suite.values()}
+    assert len(equal) == 1
+
+
+def test_minutes_of_a_run_are_those_of_its_stages():
+    """The clock starts anew with each stage; steps after the last logged one go on at its pace."""
+    rows = [
+        {"step": 1, "stage": "depth", "seconds": 3.0, "total": 1.0},
+        {"step": 21, "stage": "depth", "seconds": 23.0, "total": 1.0},
+        {"step": 41, "stage": "normal", "seconds": 2.0, "total": 1.0},
+        {"step": 41, "stage": "depth", "val_mae": 0.001},
+        {"step": 61, "stage": "normal", "seconds": 42.0, "total": 1.0},
+    ]
+    assert trained_minutes(rows, 71) == pytest.approx((23 + 19 * 1 + 42 + 10 * 2) / 60)
+    assert trained_minutes([], 5) == 0
+
+
+def test_a_card_tells_of_its_run(dataset, runs):
+    """Preset and differences, digest and counts of the data, the budget that the checkpoint remembers, how to go on."""
+    text = (runs / "demo-1" / "README.md").read_text()
+    provenance = load_model(runs / "demo-1")[2]
+    assert "differences from the preset `demo`" in text
+    assert "| training.seed | `0` | `1` |" in text
+    assert sha256_of(dataset / "manifest.json") in text
+    assert "| train | 1 | 2 | 4 |" in text
+    assert f"{provenance['steps']} step" in text
+    assert f"tofcapture evaluate {dataset} --weights {runs / 'demo-1'}" in text
+    assert "val MAE mm" in text
+    assert provenance["minutes"] >= 0
+    assert provenance["torch"] == torch.__version__
+    assert budget(runs / "demo-1" / "model.safetensors", provenance)["steps"] == provenance["steps"]
+
+
+def test_a_preset_differs_from_itself_in_nothing():
+    """Each is its own closest one."""
+    for name in presets():
+        assert closest_preset(preset(name))[1] == {}
 
 
 def test_wrong_weights_and_scenes_are_named(dataset, runs):
@@ -239,11 +315,24 @@ def test_a_backend_without_its_file_says_what_to_do(dataset, runs, tmp_path):
 
 
 @pytest.mark.slow
-def test_all_tables_by_one_script(dataset, tmp_path):
-    """benchmarks/tables.py trains everything with tiny budgets and writes three suites."""
+def test_all_tables_by_one_script(dataset, runs, tmp_path):
+    """benchmarks/tables.py trains everything with tiny budgets, writes three tables, and a second call trains nothing."""
+    pack(dataset, "train", tmp_path / "packed")
+    other = make_dataset(tmp_path / "other", scale=2, views=1, splits=("test",), seed=9)
     script = Path(__file__).parents[1] / "benchmarks" / "tables.py"
-    command = [sys.executable, str(script), str(dataset), "--out", str(tmp_path), "--minutes", "0.001"]
-    subprocess.run([*command, "--width", "2", "--crop", "48", "--frames", "1"], check=True, timeout=280)
+    small = ["--minutes", "0.001", "--width", "2", "--crop", "48", "--frames", "1", "--threads", "1"]
+    data = ["--cache", str(tmp_path / "packed"), "--test", str(other), "--add", f"long={runs / 'demo-0'}"]
+    command = [sys.executable, str(script), str(dataset), "--out", str(tmp_path), *small, *data]
+    subprocess.run(command, check=True, timeout=560)
+    weights = tmp_path / "runs" / "paper-0" / "model.safetensors"
+    made = weights.stat().st_mtime_ns
     for suite in ("main", "ablation", "inputs"):
         assert (tmp_path / suite / "tables.md").exists()
-        assert json.loads((tmp_path / suite / "results.json").read_text())["suite"] == suite
+        results = json.loads((tmp_path / suite / "results.json").read_text())
+        assert (results["suite"], results["dataset"]) == (suite, str(other))
+        assert ("long" in results["methods"]) == (suite == "main")
+        assert results["methods"]["paper"]["budget"]["steps"] >= 1
+    refused = subprocess.run([*command, "--suite", "inputs"], check=False, timeout=60, capture_output=True)
+    assert refused.returncode == 2
+    subprocess.run([*command, "--suite", "main"], check=True, timeout=560)
+    assert weights.stat().st_mtime_ns == made

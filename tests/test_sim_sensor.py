@@ -7,9 +7,10 @@ import pytest
 
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.light import Light
-from tofcapture.devices.sim.sensor import Sensor, expose, ideal, scatter
+from tofcapture.devices.sim.sensor import Sensor, check_channels, expose, ideal, scatter
+from tofcapture.errors import ConfigError
 from tofcapture.frames import TofInfo
-from tofcapture.ops.phase import mean_phasors, phasors, wrapped_range
+from tofcapture.ops.phase import Decoder, mean_phasors, phasors, wrapped_range
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError
 
 HZ = (20e6, 100e6)
@@ -157,3 +158,36 @@ def test_same_generator_same_burst():
     """A burst is a function of light, sensor and generator."""
     np.testing.assert_array_equal(take(Sensor(), frames=2, seed=3)[0], take(Sensor(), frames=2, seed=3)[0])
     assert (take(Sensor(), seed=3)[0] != take(Sensor(), seed=4)[0]).any()
+
+
+def test_other_channels_decode_to_the_range():
+    """15 and 75 MHz with three phases each, in any order of channels: the ideal taps give the range, and so does the decoder."""
+    thirds = (0.0, 2 * np.pi / 3, 4 * np.pi / 3)
+    order = [4, 0, 2, 5, 1, 3]
+    hz, phase = np.repeat((15e6, 75e6), 3)[order], np.tile(thirds, 2)[order]
+    channels = {"modulation_hz": tuple(hz), "phase_rad": tuple(phase)}
+    info = TofInfo("test", "0", CAMERA, np.zeros(3), **channels)
+    distance = 1.7
+    turn = (
+        4 * np.pi * np.array([15e6, 75e6])[:, None, None] * np.full(CAMERA.shape, distance) / SPEED_OF_LIGHT
+    )
+    light = Light(phasor=0.5 * np.exp(1j * turn), steady=np.full(CAMERA.shape, 0.5))
+    raw, _ = expose(light, replace(CLEAN, **channels), info, 1, np.random.default_rng(0), 0)
+    assert raw.shape == (1, 6, *CAMERA.shape)
+    depth = Decoder(info)(raw[0]).depth
+    np.testing.assert_allclose(depth * CAMERA.ray_lengths, distance, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"phase_rad": (0.0,) * 7}, "8 phase_rad"),
+        ({"contrast": (0.5,)}, "contrast"),
+        ({"phase_rad": (0.0,) * 8}, "do not determine a phasor"),
+        ({"range_errors": (RangeError(15e6),)}, "which no channel has"),
+    ],
+)
+def test_channels_that_no_decoder_takes_are_refused(change, message):
+    """Each with the key and what it should hold."""
+    with pytest.raises(ConfigError, match=message):
+        check_channels(replace(Sensor(), **change), "world")

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tofcapture.errors import ConfigError
+
 
 class Frame(NamedTuple):
     """One ToF frame per batch item, float32.
@@ -14,7 +16,7 @@ class Frame(NamedTuple):
     Attributes
     ----------
     raw
-        (B, 8, H, W) raw channels in units of the sensor's saturation value.
+        (B, K, H, W) raw channels in units of the sensor's saturation value.
     phasor
         (B, 4, H, W) I and Q of the low, then of the high frequency, in the same unit.
     depth
@@ -90,6 +92,21 @@ class Estimate(NamedTuple):
     error: Tensor
     initial_depth: Tensor
     initial_normals: Tensor
+
+
+def expect_channels(raw: Tensor, channels: int, network: str) -> None:
+    """Say what to do where a network is given another camera's raw channels (B, K, H, W) than it was made for.
+
+    Raises
+    ------
+    ConfigError
+        ``raw`` has not ``channels`` channels.
+    """
+    if raw.shape[1] != channels:
+        raise ConfigError(
+            f"{network}: expected {channels} raw channels, got {raw.shape[1]} from this camera",
+            hint="take the preset compact, which reads phasors, or one of the network's inputs other than raw",
+        )
 
 
 def frame_to(frame: Frame, device: torch.device) -> Frame:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.config import SOURCES, Network
-from tofcapture_model.frame import Frame
+from tofcapture_model.frame import Frame, expect_channels
 from tofcapture_model.geometry import local_planes, plane_normals, rays, side_window_planes, unit
 from tofcapture_model.unet import (
     CONVEX_CHANNELS,
@@ -26,6 +26,10 @@ from tofcapture_model.unet import (
 
 CUE_SCALE = (1.0, 1.0, 0.01, 0.3)  # what one may expect of each cue: most lenses scatter about one percent
 RESIDUAL_UNIT = 0.01  # m; a head's output of 1 moves the depth by a centimetre
+MIDDLE, REACH = (
+    0.8,
+    0.4,
+)  # m; where depth starts, and a head's unit, where the decoded depth is not to be seen
 FIT_RADII = (1, 2)  # px of the sensor, of the planes that compact fits to its own depth
 _HEAD_WIDTH = 24
 _HOLE = 1e-3  # weight of a filled pixel
@@ -60,6 +64,8 @@ class PaperInputs(nn.Module):
 
     def forward(self, frame: Frame) -> Features:
         """Take the chosen sources of a frame as they are; normals start towards the camera."""
+        if "raw" in self.sources:
+            expect_channels(frame.raw, SOURCES["raw"], "paper")
         image = torch.cat([getattr(frame, s) for s in self.sources], dim=1)
         towards = -unit(rays(frame.intrinsics, *frame.depth.shape[-2:]))
         return Features(image, frame.depth[:, :0], towards)
@@ -124,13 +130,19 @@ def _head(network: Network, channels: int, outputs: int) -> nn.Module:
     return _zeroed(channels, outputs)
 
 
+def sees_decoded(network: Network) -> bool:
+    """Whether a network may use the decoded depth: only then is its answer a correction of it (paper, table IV: Conf., Raw)."""
+    return network.kind != "paper" or "depth" in network.inputs
+
+
 class Raw2Depth(nn.Module):
-    """Decoded depth + gated steps to its candidates + residual, then convex upsampling."""
+    """Decoded depth + gated steps to its candidates + residual, then convex upsampling; without it, depth about ``MIDDLE``."""
 
     def __init__(self, network: Network, channels: int) -> None:
         super().__init__()
         self.candidates = len(network.windows) + len(CUE_SCALE) if network.kind == "compact" else 0
         self.max_residual, self.learned = network.max_residual, network.learned_upsampling
+        self.decoded = sees_decoded(network)
         self.net = _head(network, channels, self.candidates + 1 + CONVEX_CHANNELS)
         self.register_buffer("bilinear", bilinear_logits().reshape(1, -1, 1, 1), persistent=False)
         self.bilinear: Tensor
@@ -139,7 +151,9 @@ class Raw2Depth(nn.Module):
         """Return depth (B, 1, 2H, 2W), metres."""
         gates, residual, logits = self.net(shared).float().split([self.candidates, 1, CONVEX_CHANNELS], dim=1)
         steps = (gates * (features.candidates - frame.depth)).sum(1, keepdim=True)
-        depth = frame.depth + steps + self._bounded(residual * RESIDUAL_UNIT)
+        start = frame.depth if self.decoded else torch.full_like(frame.depth, MIDDLE)
+        unit_of = RESIDUAL_UNIT if self.decoded else REACH
+        depth = start + steps + self._bounded(residual * unit_of)
         learned = logits if self.learned else torch.zeros_like(logits)
         return convex_upsample(depth.clamp_min(0.05), learned + self.bilinear)
 
@@ -154,13 +168,15 @@ class ErrorMap(nn.Module):
     def __init__(self, network: Network, channels: int) -> None:
         super().__init__()
         self.net = _head(network, channels + 4, 4)
+        self.decoded = sees_decoded(network)
         self.register_buffer("calibration", torch.ones(()))  # set after training, see evaluate.calibrate
         self.calibration: Tensor
 
     def forward(self, shared: Tensor, depth: Tensor, frame: Frame) -> Tensor:
         """Return (B, 1, 2H, 2W), metres, positive."""
-        change = F.pixel_unshuffle(depth.detach(), 2) - frame.depth
-        out = self.net(torch.cat([shared, (change * 20).clamp(-2, 2)], dim=1)).float()
+        fine = F.pixel_unshuffle(depth.detach(), 2)
+        seen = (fine - frame.depth) * 20 if self.decoded else (fine - MIDDLE) / REACH
+        out = self.net(torch.cat([shared, seen.clamp(-2, 2)], dim=1)).float()
         return F.softplus(F.pixel_shuffle(out, 2)) * (RESIDUAL_UNIT * self.calibration)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +23,9 @@ from tofcapture_model.evaluate import write_results
 from tofcapture_model.frame import Frame, Target, frame_to, target_to
 from tofcapture_model.measures import Precision, Uncertainty, regions
 from tofcapture_model.metrics import Score
+from tofcapture_model.run_card import budget
 from tofcapture_model.tables import SUITES, write_tables
+from tofcapture_model.zoo import Model
 
 FREE = {"sensor": sensor.estimate, "lf2": lf2.estimate}
 """Methods without parameters; they take part in every suite."""
@@ -86,8 +88,7 @@ def _free(name: str) -> Callable[[Frame], Answer]:
     return answer
 
 
-def _learned(path: Path, device: torch.device) -> Callable[[Frame], Answer]:
-    model = load_model(path)[0].to(device)
+def _learned(model: Model) -> Callable[[Frame], Answer]:
     own = not isinstance(model, Baseline)
 
     def answer(frame: Frame) -> Answer:
@@ -157,14 +158,41 @@ def run_suite(
 
     Parameters
     ----------
-    dataset
-        Folder with ``manifest.json``.
+    dataset, weights, split, frames, scenes, device, progress
+        As of :func:`measure_runs`.
     suite
         One of ``SUITES``, or ``all``.
-    weights
-        Checkpoints or run folders by name; several of one name are runs that are averaged, their spread is told.
     out
         ``results.json``.
+
+    Returns
+    -------
+    What was written; lengths in metres.
+    """
+    results = measure_runs(
+        dataset, weights, split=split, frames=frames, scenes=scenes, device=device, progress=progress
+    )
+    return write_suite(results, suite, out)
+
+
+def measure_runs(
+    dataset: Path,
+    weights: Mapping[str, Sequence[Path]],
+    *,
+    split: str = "test",
+    frames: int = 0,
+    scenes: str = "",
+    device: str = "cpu",
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Measure the methods without parameters and all runs, one network in memory at a time.
+
+    Parameters
+    ----------
+    dataset
+        Folder with ``manifest.json``.
+    weights
+        Checkpoints or run folders by name; several of one name are runs that are averaged, their spread is told.
     split
         ``train``, ``val`` or ``test``.
     frames
@@ -178,42 +206,81 @@ def run_suite(
 
     Returns
     -------
-    What was written; lengths in metres.
+    Results; lengths in metres.
+
+    Raises
+    ------
+    ConfigError
+        No scene of the split begins so, or weights that are not there.
     """
     place = torch.device(device)
-    methods: dict[str, Callable[[Frame], Answer]] = {name: _free(name) for name in FREE}
-    trained: dict[str, Any] = {}
-    for name, paths in weights.items():
-        for i, path in enumerate(paths):
-            methods[f"{name}#{i}"] = _learned(path, place)
-            trained[f"{name}#{i}"] = {"weights": str(find_model(path)), "training": load_model(path)[2]}
+    runs = [(name, i, find_model(path)) for name, paths in weights.items() for i, path in enumerate(paths)]
+    for _, _, path in runs:
+        load_model(path)  # says what is wrong with it, before hours of measuring
     data = FrameDataset(dataset, split, frames=frames, cache_bytes=0)
     data.samples = [s for s in data.samples if s.scene.startswith(scenes)]
     if not data.samples:
         raise ConfigError(
             f"--scenes {scenes}: no scene of the split {split} begins so", hint=", ".join(data.readers)
         )
-    rows = measure(data, methods, place, progress)
-    table = {name: averaged([rows[name]]) for name in FREE}
-    table |= {n: averaged([rows[f"{n}#{i}"] for i in range(len(p))]) for n, p in weights.items()}
-    results = {
+    count = len(data.samples)
+
+    def part(nth: int) -> Callable[[int, int], None]:
+        return lambda done, _all: progress(nth * count + done, (len(runs) + 1) * count) if progress else None
+
+    rows = measure(data, {name: _free(name) for name in FREE}, place, part(0))
+    table = {name: averaged([row]) for name, row in rows.items()}
+    trained: dict[str, Any] = {}
+    by_name: dict[str, list[dict[str, Any]]] = {}
+    for nth, (name, i, path) in enumerate(runs, 1):
+        model, _, provenance = load_model(path)
+        trained[f"{name}#{i}"] = {"weights": str(path), "training": provenance}
+        row = measure(data, {name: _learned(model.to(place))}, place, part(nth))[name]
+        by_name.setdefault(name, []).append({**row, "budget": budget(path, provenance)})
+    data.close()
+    table |= {name: averaged(found) for name, found in by_name.items()}
+    return {
         "format": "tofcapture-results",
         "version": 1,
         "dataset": str(dataset),
         "split": split,
-        "suite": suite,
         "scenes": sorted({s.scene for s in data.samples}),
         "views": len({(s.scene, s.view) for s in data.samples}),
-        "frames": len(data.samples),
+        "frames": count,
         "units": "m",
         "runs": trained,
         "methods": {name: mean for name, (mean, _) in table.items()},
         "spread": {name: spread for name, (_, spread) in table.items() if len(weights.get(name, ())) > 1},
     }
-    data.close()
-    write_results(Path(out), _finite(results))
-    write_tables(Path(out), results, list(SUITES) if suite == "all" else [suite])
-    return results
+
+
+def write_suite(
+    results: Mapping[str, Any], suite: str, out: Path, names: Collection[str] | None = None
+) -> dict[str, Any]:
+    """Write ``results.json`` and tables.
+
+    Parameters
+    ----------
+    results
+        Of :func:`measure_runs`.
+    suite
+        One of ``SUITES``, or ``all``.
+    out
+        ``results.json``; the tables go beside it.
+    names
+        Methods that take part; ``None``: all.
+
+    Returns
+    -------
+    What was written.
+    """
+    named = {**results, "suite": suite}
+    if names is not None:
+        for key in ("methods", "spread", "runs"):
+            named[key] = {n: row for n, row in results[key].items() if n.partition("#")[0] in names}
+    write_results(Path(out), _finite(named))
+    write_tables(Path(out), named, list(SUITES) if suite == "all" else [suite])
+    return named
 
 
 def _finite(value: Any) -> Any:

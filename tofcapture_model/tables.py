@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +14,23 @@ from tofcapture.files.seal import write_text
 
 @dataclass(frozen=True)
 class Column:
-    """Words, where the number is in a method's results, factor into the printed unit, digits; ``more``: more is better."""
+    """Words, where the number is in a method's results, factor into the printed unit, digits; ``best``: its least, most or no value."""
 
     words: str
     path: tuple[str, ...]
     factor: float = 1e3
     digits: int = 2
-    more: bool = False
+    best: Callable[..., float] | None = min
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Title, columns, and which names of weights take part besides the methods without parameters (empty: all)."""
+    """Title, columns, rows: names of methods and what the table calls them, in its order; ``others``: those that no table names follow."""
 
     title: str
     columns: tuple[Column, ...]
-    names: tuple[str, ...] = ()
+    rows: Mapping[str, str] = field(default_factory=dict)
+    others: bool = True
 
 
 def _main(pool: str) -> tuple[Column, ...]:
@@ -59,14 +60,53 @@ def _by_region(*names: str) -> tuple[Column, ...]:
 _QUALITY = (
     *_by_region("edge", "interior"),
     Column("precision mm", ("extra", "precision")),
-    Column("within 1 sigma %", ("extra", "coverage_1sigma"), 100, 1, more=True),
+    Column("within 1 sigma %", ("extra", "coverage_1sigma"), 100, 1, best=max),
     Column("AUSE", ("extra", "ause"), 1, 3),
-    Column("coverage %", ("depth", "pixel", "coverage"), 100, 1, more=True),
+    Column("coverage %", ("depth", "pixel", "coverage"), 100, 1, best=max),
+)
+_BUDGET = (
+    Column("minutes", ("budget", "minutes"), 1, 1, best=None),
+    Column("steps", ("budget", "steps"), 1, 0, best=None),
 )
 SUITES: Mapping[str, Suite] = {
-    "main": Suite("Comparison (the paper's table II)", (*_main("pixel"), *_QUALITY)),
-    "ablation": Suite("Ablation of modules (table III)", _main("pixel"), ("paper", "without-")),
-    "inputs": Suite("Inputs (table IV)", _main("pixel"), ("paper", "inputs-")),
+    "main": Suite(
+        "Comparison (the paper's table II; Ours is the paper's network)",
+        (*_main("pixel"), *_QUALITY, *_BUDGET),
+        {
+            "sensor": "ToF sensor",
+            "lf2": "LF2",
+            "su2018": "Su et al.",
+            "guo2018": "Guo et al.",
+            "coarse-fine": "Agresti et al.",
+            "paper": "Ours",
+        },
+    ),
+    "ablation": Suite(
+        "Ablation of modules (table III)",
+        (*_main("pixel"), *_BUDGET),
+        {
+            "sensor": "ToF sensor",
+            "inputs-raw": "w/o multi-input",
+            "without-chamfer": "w/o Chamfer loss",
+            "without-error-map": "w/o error map",
+            "without-refinement": "w/o refinement",
+            "paper": "Ours (full model)",
+        },
+        others=False,
+    ),
+    "inputs": Suite(
+        "Inputs (table IV)",
+        (*_main("pixel"), *_BUDGET),
+        {
+            "sensor": "ToF sensor",
+            "inputs-confidence": "Conf.",
+            "inputs-raw": "Raw",
+            "inputs-depth": "Depth",
+            "inputs-raw-depth": "Depth + Raw",
+            "paper": "Depth + Conf. + Raw",
+        },
+        others=False,
+    ),
     "mpi": Suite("Multipath", _by_region("mpi", "no-mpi")),
     "noise": Suite("Noise", (Column("precision mm", ("extra", "precision")), *_by_region("dark", "bright"))),
     "indoor": Suite("Indoor scenes", _main("image")),
@@ -74,20 +114,19 @@ SUITES: Mapping[str, Suite] = {
 
 
 def cells(results: Mapping[str, Any], suite: Suite) -> list[tuple[str, list[tuple[str, bool]]]]:
-    """Rows: the method's name, and text and "is the best" of every column."""
-    methods = {
-        name: table
-        for name, table in results["methods"].items()
-        if name in ("sensor", "lf2") or not suite.names or name.startswith(suite.names)
-    }
+    """Rows: what the table calls the method, and text and "is the best" of every column."""
+    found = results["methods"]
+    named = {name for one in SUITES.values() for name in one.rows if suite.rows}
+    others = [name for name in found if suite.others and name not in named]
+    methods = {name: found[name] for name in (*suite.rows, *others) if name in found}
     columns = [_column(methods, results.get("spread", {}), c) for c in suite.columns]
-    return [(name, [column[i] for column in columns]) for i, name in enumerate(methods)]
+    return [(suite.rows.get(name, name), [column[i] for column in columns]) for i, name in enumerate(methods)]
 
 
 def _column(methods: Mapping[str, Any], spread: Mapping[str, Any], column: Column) -> list[tuple[str, bool]]:
     values = [_value(table, column) for table in methods.values()]
     known = [abs(v) for v in values if v is not None]
-    best = (max if column.more else min)(known, default=math.nan)
+    best = column.best(known, default=math.nan) if column.best else math.nan
     out = []
     for name, value in zip(methods, values, strict=True):
         if value is None:

@@ -34,8 +34,9 @@ from tofcapture_model.data import FrameDataset, collate, epoch_batches
 from tofcapture_model.evaluate import calibrate, model_method, score
 from tofcapture_model.frame import Estimate, frame_to, target_to
 from tofcapture_model.joint import JointModel
+from tofcapture_model.run_card import write_card
 from tofcapture_model.runlog import Log, Position
-from tofcapture_model.zoo import Model, build_model, select_stage, training_loss
+from tofcapture_model.zoo import Model, build_model, compiled, select_stage, training_loss
 
 SAVE_EVERY = 60.0  # s between resume points
 LOG_EVERY = 20  # steps
@@ -151,7 +152,7 @@ def train(
             _restore(optimizer, names, moments)
             wrapped = nn.parallel.DistributedDataParallel(model) if world > 1 else model
             half = torch.autocast(place.type, torch.bfloat16, enabled=config.training.precision == "bfloat16")
-            called = torch.compile(wrapped) if config.training.compile else wrapped
+            called = compiled(wrapped, place) if config.training.compile else wrapped
             started, saved = time.monotonic() - position.elapsed, time.monotonic()
             while not _done(position, stage, budget):
                 batches = epoch_batches(
@@ -195,7 +196,7 @@ def train(
                         break
                 position.epoch, position.batch = position.epoch + 1, 0
                 every = config.training.validate_every
-                if rank == 0 and (_done(position, stage, budget) or (every and position.epoch % every == 0)):
+                if rank == 0 and every and (_done(position, stage, budget) or position.epoch % every == 0):
                     log.validation(position, stage, _validate(model, dataset, place))
             position.epoch, position.elapsed, moments = 0, 0.0, {}
         position.stage = len(config.stages)
@@ -204,6 +205,7 @@ def train(
             provenance: dict[str, Any] = {**source, "steps": position.step, "losses": losses}
             if isinstance(model, JointModel) and config.losses.uncertainty == "laplace":
                 provenance["uncertainty"] = calibrate(model, dataset, place)
+            provenance |= write_card(out, config, model, dataset, place, provenance, minutes)
             save_model(out / "model.safetensors", model, config, provenance)
             save_resume(out / "resume.safetensors", model, optimizer, names, _state(position, key))
         log.close()

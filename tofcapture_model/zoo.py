@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+
 import torch
 from torch import nn
 
+from tofcapture.errors import ConfigError
 from tofcapture_model.baselines.coarse_fine import CoarseFine
 from tofcapture_model.baselines.guo2018 import MRM
 from tofcapture_model.baselines.protocol import Baseline
@@ -40,11 +44,31 @@ def build_model(config: Config) -> Model:
     return model.to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 
+def compiled(model: nn.Module, device: torch.device) -> nn.Module:
+    """Compile a model (``training.compile``).
+
+    Raises
+    ------
+    ConfigError
+        PyTorch would find no C++ compiler for a CPU.
+    """
+    compiler = os.environ.get("CXX", "g++")
+    if device.type == "cpu" and shutil.which(compiler) is None:
+        raise ConfigError(
+            f"training.compile: expected the C++ compiler {compiler}, found none",
+            hint="install g++, name one in CXX, or leave compile = false",
+        )
+    return torch.compile(model)  # type: ignore[return-value]
+
+
 def select_stage(model: Model, stage: str) -> list[nn.Parameter]:
     """Freeze all parameters but those that learn in ``stage``; return these. All of a baseline learn in its only stage."""
     learning = []
+    none = isinstance(model, JointModel) and not len(model.refinement.depth_gain)
+    idle = {"refinement"} if none else set[str]()
     for name, parameter in model.named_parameters():
-        parameter.requires_grad_(isinstance(model, Baseline) or name.split(".")[0] in PARTS[stage])
+        part = name.split(".")[0]
+        parameter.requires_grad_(isinstance(model, Baseline) or part in {*PARTS[stage]} - idle)
         learning += [parameter] if parameter.requires_grad else []
     return learning
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.baselines.protocol import Baseline
-from tofcapture_model.frame import Estimate, Frame, Target
+from tofcapture_model.frame import Estimate, Frame, Target, expect_channels
 from tofcapture_model.geometry import turned_depth
 from tofcapture_model.losses import masked_mean
 from tofcapture_model.unet import pad_to_multiple
@@ -72,6 +72,7 @@ class MRM(Baseline):
 
     def estimate_depth(self, frame: Frame) -> Tensor:
         """Decode the mixed channels relative to the frame's own decoding, calibration and unwrapping included."""
+        expect_channels(frame.raw, self.channels, "guo2018")
         kernels = self.kernels(frame.raw).float()
         with torch.autocast(frame.raw.device.type, enabled=False):
             mixed = torch.einsum("bcihw,bchw->bihw", kernels, frame.raw)

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.devices.sim.light import Light
-from tofcapture.frames import TofInfo
+from tofcapture.errors import ConfigError, DataError
+from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
 from tofcapture.ops.phase import Complex128, frequencies, radius_px
+from tofcapture.ops.phase.phasor import solution
 from tofcapture.poses import Float64
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError, image_places
 
@@ -27,6 +29,8 @@ class Sensor:
 
     Attributes
     ----------
+    modulation_hz, phase_rad
+        (K,) frequency and demodulation phase of each raw channel.
     signal
         Raw units that a white surface (albedo 1) facing the camera at 1 m adds to each tap in the nominal exposure.
     contrast
@@ -57,6 +61,8 @@ class Sensor:
         Draw Poisson numbers of electrons.
     """
 
+    modulation_hz: tuple[float, ...] = PAPER_MODULATION_HZ
+    phase_rad: tuple[float, ...] = PAPER_PHASE_RAD
     signal: float = 280.0
     contrast: tuple[float, ...] = (0.85, 0.6)
     exposure: float = 400e-6
@@ -74,6 +80,33 @@ class Sensor:
     celsius_drift: float = 0.3
     quantise: bool = True
     shot_noise: bool = True
+
+
+def check_channels(sensor: Sensor, where: str) -> None:
+    """Refuse channels that no decoder could take, and range errors of frequencies that the sensor does not have.
+
+    Raises
+    ------
+    ConfigError
+        Naming the key and what it should hold.
+    """
+    hz, K = frequencies(sensor.modulation_hz), len(sensor.modulation_hz)
+    if len(sensor.phase_rad) != K or len(sensor.contrast) != len(hz):
+        raise ConfigError(
+            f"{where}: expected {K} phase_rad as modulation_hz has channels, and a contrast for each of {len(hz)} frequencies, "
+            f"got {len(sensor.phase_rad)} and {len(sensor.contrast)}"
+        )
+    try:
+        for f in hz:
+            solution(sensor.modulation_hz, sensor.phase_rad, f)
+    except DataError as err:
+        raise ConfigError(f"{where}: {err}", hint="three phases or more, spread over the turn") from err
+    foreign = [e.modulation_hz for e in sensor.range_errors if e.modulation_hz not in hz]
+    if foreign:
+        raise ConfigError(
+            f"{where}: range_error of {', '.join(f'{f / 1e6:g}' for f in foreign)} MHz, which no channel has",
+            hint="give [[range_error]] tables of the frequencies that modulation_hz names, or range_error = []",
+        )
 
 
 def ideal(sensor: Sensor) -> Sensor:

@@ -106,13 +106,16 @@ def read_constants(overrides: Mapping[str, Any], where: str) -> Constants:
         raise ConfigError(f"{where}: [tof] illuminator: expected 3 numbers, got {illuminator.tolist()}")
     sensor = merged(overrides, where, "sensor")
     errors = tuple(range_error_from(e) for e in sensor.pop("range_error"))
-    sensor["contrast"] = tuple(sensor["contrast"])
+    for key in ("modulation_hz", "phase_rad", "contrast"):
+        sensor[key] = tuple(float(x) for x in sensor[key])
     sensor["harmonics"] = tuple((int(m), float(a)) for m, a in sensor["harmonics"])
+    made = _make(lambda **v: Sensor(range_errors=errors, **v), sensor, f"{where}: [sensor]")
+    sensors.check_channels(made, f"{where}: [sensor]")
     return Constants(
         tof=_make(Camera, tof, f"{where}: [tof]"),
         illuminator=illuminator,
         lamp=merged(overrides, where, "lamp"),
-        sensor=_make(lambda **v: Sensor(range_errors=errors, **v), sensor, f"{where}: [sensor]"),
+        sensor=made,
         factory=merged(overrides, where, "factory"),
         stereo=_make(Camera, merged(overrides, where, "stereo"), f"{where}: [stereo]"),
         stereo_model=_make(StereoModel, merged(overrides, where, "stereo_model"), f"{where}: [stereo_model]"),
@@ -160,6 +163,11 @@ def factory_calibration(constants: Constants, seed: int) -> tuple[RangeError, ..
     return tuple(out)
 
 
+def _model_name(constants: Constants) -> str:
+    megahertz = "/".join(f"{f / 1e6:g}" for f in frequencies(constants.sensor.modulation_hz))
+    return f"simulated {constants.tof.width}x{constants.tof.height} {megahertz} MHz"
+
+
 class SimWorld:
     """A scene, a pose, and what the devices of one station measure there.
 
@@ -185,10 +193,12 @@ class SimWorld:
         self._lit: tuple[object, Light] | None = None
         self.faults = Faults(FaultPlan())
         self.tof_info = TofInfo(
-            model="simulated 240x180 20/100 MHz",
+            model=_model_name(constants),
             serial=f"sim-tof-{seed}",
             camera=constants.tof,
             illuminator=constants.illuminator,
+            modulation_hz=constants.sensor.modulation_hz,
+            phase_rad=constants.sensor.phase_rad,
             exposure=constants.sensor.exposure,
             saturation=constants.sensor.full_scale,
             range_errors=factory_calibration(constants, seed),
