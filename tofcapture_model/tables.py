@@ -14,13 +14,13 @@ from tofcapture.files.seal import write_text
 
 @dataclass(frozen=True)
 class Column:
-    """Words, where the number is in a method's results, factor into the printed unit, digits; ``best``: its least, most or no value."""
+    """Words, where the number is in a method's results, factor into the printed unit, digits; ``best``: ``least``, ``most`` or ``none``."""
 
     words: str
     path: tuple[str, ...]
     factor: float = 1e3
     digits: int = 2
-    best: Callable[..., float] | None = min
+    best: str = "least"
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,13 @@ def _by_region(*names: str) -> tuple[Column, ...]:
 _QUALITY = (
     *_by_region("edge", "interior"),
     Column("precision mm", ("extra", "precision")),
-    Column("within 1 sigma %", ("extra", "coverage_1sigma"), 100, 1, best=max),
+    Column("within 1 sigma %", ("extra", "coverage_1sigma"), 100, 1, best="most"),
     Column("AUSE", ("extra", "ause"), 1, 3),
-    Column("coverage %", ("depth", "pixel", "coverage"), 100, 1, best=max),
+    Column("coverage %", ("depth", "pixel", "coverage"), 100, 1, best="most"),
 )
 _BUDGET = (
-    Column("minutes", ("budget", "minutes"), 1, 1, best=None),
-    Column("steps", ("budget", "steps"), 1, 0, best=None),
+    Column("minutes", ("budget", "minutes"), 1, 1, best="none"),
+    Column("steps", ("budget", "steps"), 1, 0, best="none"),
 )
 SUITES: Mapping[str, Suite] = {
     "main": Suite(
@@ -123,10 +123,17 @@ def cells(results: Mapping[str, Any], suite: Suite) -> list[tuple[str, list[tupl
     return [(suite.rows.get(name, name), [column[i] for column in columns]) for i, name in enumerate(methods)]
 
 
+_BEST: Mapping[str, Callable[..., float]] = {
+    "least": min,
+    "most": max,
+    "none": lambda _values, default: default,
+}
+
+
 def _column(methods: Mapping[str, Any], spread: Mapping[str, Any], column: Column) -> list[tuple[str, bool]]:
     values = [_value(table, column) for table in methods.values()]
     known = [abs(v) for v in values if v is not None]
-    best = column.best(known, default=math.nan) if column.best else math.nan
+    best = _BEST[column.best](known, default=math.nan)
     out = []
     for name, value in zip(methods, values, strict=True):
         if value is None:
