@@ -44,7 +44,9 @@ class Refinement(nn.Module):
         """
         confidence = error.detach().clamp_min(_MIN_ERROR) ** -2
         confidence = confidence / confidence.amax(dim=(2, 3), keepdim=True)
-        for depth_gain, normal_gain in zip(self.depth_gain, self.normal_gain, strict=True):
+        # by number: a loop over an empty parameter is an operation that torch.export cannot read back
+        for k in range(len(self.depth_gain)):
+            depth_gain, normal_gain = self.depth_gain[k], self.normal_gain[k]
             # a measurement of the present depth, not a path for gradients: those reach the depth by propagation
             fitted = depth_to_normals(depth.detach(), confidence, intrinsics, radius=4)
             normals = unit(normals + _GAIN_UNIT * normal_gain * (fitted - normals))

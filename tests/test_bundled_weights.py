@@ -1,0 +1,63 @@
+"""The bundled network: it is there, it is what its card says, and it holds its ratios on scenes it has never seen."""
+
+# ruff: noqa: E402  torch is optional
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from tofcapture.cli import main
+from tofcapture.files.manifest import load_manifest
+from tofcapture_model.checkpoint import find_model, load_model
+from tofcapture_model.config import loads_config, preset
+from tofcapture_model.export import example
+from tofcapture_model.suite import run_suite
+
+CARD = files("tofcapture_model") / "weights" / "MODEL_CARD.md"
+LARGEST = 16 * 2**20  # bytes
+
+
+def test_the_bundled_network_is_the_preset_compact_and_finite():
+    """Loaded without a path: network and losses of `compact`, half-precision file, float32 model, a finite answer at twice the size."""
+    model, config, provenance = load_model(None)
+    assert (config.network, config.losses) == (preset("compact").network, preset("compact").losses)
+    assert find_model(None).stat().st_size < LARGEST
+    assert loads_config(find_model(None).with_suffix(".toml").read_text(encoding="utf-8")) == config
+    assert all(p.dtype == torch.float32 for p in model.parameters())
+    with torch.no_grad():
+        found = model(example(1))
+    assert found.depth.shape == (1, 1, 360, 480)
+    assert all(bool(torch.isfinite(x).all()) for x in found)
+    assert provenance["steps"] > 1000
+
+
+def test_the_card_names_the_data_that_the_weights_remember():
+    """Digest of the manifest, steps and the factor of the uncertainty stand in the card as in the file."""
+    provenance = load_model(None)[2]
+    text = CARD.read_text(encoding="utf-8")
+    assert provenance["manifest_sha256"][:16] in text
+    assert f"{provenance['steps']:,} steps" in text
+    assert f"{provenance['uncertainty']['factor']:.2f}" in text
+
+
+@pytest.mark.slow
+def test_it_holds_its_ratios_on_scenes_of_another_camera(tmp_path):
+    """Eight views of objects that no training scene holds, by a camera it has not seen: depth, normals, uncertainty."""
+    out = tmp_path / "data"
+    line = ["simulate-dataset", "--seed", "9090", "--scenes", "4", "--views", "2", "--frames", "1"]
+    kinds = ["--kinds", "object", "combination", "concave", "corner"]
+    assert main([*line, *kinds, "--split", "test", "--jobs", "1", "--out", str(out), "--json"]) == 0
+    assert len(load_manifest(out).split("test")) == 4
+    run_suite(out, "main", {"bundled": [find_model(None)]}, tmp_path / "results.json")
+    methods = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["methods"]
+    model, sensor = ({**methods[name]["depth"]["pixel"]} for name in ("bundled", "sensor"))
+    assert model["mae"] < 0.35 * sensor["mae"]
+    assert model["sq"] < 0.20 * sensor["sq"]
+    assert model["rmse"] < 0.6 * sensor["rmse"]
+    angles = [methods[name]["normal"]["pixel"]["mean_deg"] for name in ("bundled", "sensor")]
+    assert angles[0] < 0.55 * angles[1]
+    assert 0.5 < methods["bundled"]["extra"]["coverage_1sigma"] < 0.85
