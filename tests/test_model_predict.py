@@ -22,8 +22,9 @@ from tofcapture_model import checkpoint
 from tofcapture_model import predict as predicting
 from tofcapture_model.checkpoint import find_model, load_model, save_model
 from tofcapture_model.config import preset
+from tofcapture_model.data import make_frame
 from tofcapture_model.predict import predict, predict_raw
-from tofcapture_model.raw_input import NOMINAL_CAMERA, read_input
+from tofcapture_model.raw_input import NOMINAL_CAMERA, NOMINAL_RANGE_ERRORS, read_input
 from tofcapture_model.zoo import build_model
 
 ORDER = ("right", "blocks swapped", "interleaved", "reversed", "low reversed", "pairs")
@@ -37,17 +38,31 @@ CHANNELS = (
 )
 
 
-def table_top(camera, seed=0):
-    """(8, H, W) uint16 counts of a slanted table with a block on it, and its depth."""
+def table_top(camera, seed=0, shift=0.0):
+    """(8, H, W) uint16 counts of a slanted table with a block on it, ranges at 100 MHz off by ``shift``; and its depth."""
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[-1 : 1 : camera.height * 1j, -1 : 1 : camera.width * 1j]
     depth = 0.7 + 0.15 * v - 0.12 * ((np.abs(u) < 0.4) & (np.abs(v) < 0.3))
     radial = depth * camera.ray_lengths
     strength = 400 * (0.4 + 0.2 * np.sign(np.sin(9 * u))) / radial**2
     hz = (20e6, 100e6)
-    phasor = np.stack([strength * np.exp(4j * np.pi * f * radial / SPEED_OF_LIGHT) for f in hz])
+    ranges = (radial, radial + shift)
+    phasor = np.stack(
+        [strength * np.exp(4j * np.pi * f * r / SPEED_OF_LIGHT) for f, r in zip(hz, ranges, strict=True)]
+    )
     clean = taps(phasor, 1.3 * np.abs(phasor) + 60, PAPER_MODULATION_HZ, PAPER_PHASE_RAD)
     return np.clip(np.rint(rng.normal(clean, 5)), 0, 4095).astype(np.uint16), depth
+
+
+def test_without_a_rig_the_two_frequencies_say_whose_range_errors_to_take(tmp_path):
+    """An array of the known sensor (0.74 m of offset at 100 MHz) is decoded with its range errors, one without errors without."""
+    known = NOMINAL_RANGE_ERRORS[1].offset - NOMINAL_RANGE_ERRORS[0].offset
+    for offset, words in ((0.0, "no range errors"), (known, "known sensor")):
+        counts, depth = table_top(NOMINAL_CAMERA, shift=offset)
+        data = read_input(saved(tmp_path / "raw.npy", counts))
+        assert words in data.assumed
+        frame = make_frame(counts, data.info, data.camera)
+        assert np.median(np.abs(frame.depth[0].numpy() - depth)) < 0.03
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +158,7 @@ def test_tables_are_built_before_the_clock_starts(weights, tmp_path, monkeypatch
     monkeypatch.setattr(predicting, "make_frame", watched)
     data = read_input(saved(tmp_path / "raw.npy", table_top(NOMINAL_CAMERA)[0]))
     predict_raw(data, 0, weights)
-    assert len(given) == predicting.RUNS + 1
+    assert len(given) == predicting.WARM + predicting.RUNS
     assert len({id(d) for d in given}) == 1
 
 

@@ -215,7 +215,6 @@ def _configure_predict(parser: argparse.ArgumentParser) -> None:
 
 
 def _predict(args: argparse.Namespace) -> Outcome:
-    _share_cores()
     from tofcapture_model.predict import predict
 
     result = predict(
@@ -230,6 +229,8 @@ def _predict(args: argparse.Namespace) -> Outcome:
     )
     size = " x ".join(str(n) for n in reversed(result["shape"]))
     text = f"{args.out}: depth, normals and expected error at {size}, network took {result['inference_ms']:.0f} ms"
+    if result["assumed"]:
+        text += f"\nassumed: {result['assumed']}; --rig brings those of your camera"
     return Outcome(result, text)
 
 

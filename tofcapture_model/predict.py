@@ -26,7 +26,10 @@ from tofcapture_model.raw_input import RawInput, read_input
 
 Float32 = NDArray[np.float32]
 T = TypeVar("T")
-RUNS = 3  # timed runs, of which the median is told; one before them allocates
+WARM, RUNS = (
+    3,
+    7,
+)  # runs before the timed ones, which allocate and wake threads; timed runs, whose median is told
 
 
 @dataclass(frozen=True)
@@ -96,14 +99,13 @@ def predict_raw(
 
 def _timed(work: Callable[[], T], wait: Callable[[], None]) -> tuple[T, float]:
     """Answer of some work and its median time in milliseconds."""
-    answer, times = work(), []
-    wait()
-    for _ in range(RUNS):
+    times: list[float] = []
+    for _ in range(WARM + RUNS):
         started = time.perf_counter()
         answer = work()
         wait()
         times.append(1000 * (time.perf_counter() - started))
-    return answer, statistics.median(times)
+    return answer, statistics.median(times[WARM:])
 
 
 Ask = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
@@ -210,6 +212,7 @@ def predict(
     used = find_model(weights)
     return {
         "input": str(path),
+        "assumed": data.assumed,
         "weights": str(used.with_suffix(".onnx") if backend == "onnx" else used),
         "inference_ms": round(prediction.inference_ms, 2),
         "decode_ms": round(prediction.decode_ms, 2),

@@ -13,10 +13,22 @@ from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoder, ambiguity, frequencies
-from tofcapture.rig import load_rig
+from tofcapture.rig import RangeError, load_rig
 
 NOMINAL_CAMERA = Camera(width=240, height=180, fx=190.6186, fy=200.7526, cx=116.8406, cy=101.4767)
 """A real 240 x 180 sensor of 20/100 MHz; used for a plain array when no rig is given."""
+
+NOMINAL_RANGE_ERRORS = (
+    RangeError(20e6, offset=-0.01428),
+    RangeError(
+        100e6,
+        offset=-0.7427,
+        harmonics=((2, -0.006, 0.0012), (4, -0.0007, 0.0002)),
+        per_pixel_radius=1.54e-4,
+        per_kelvin=-1.8e-4,
+    ),
+)
+"""Range errors measured on that sensor; taken for a plain array without a rig whose two frequencies agree with them and not without."""
 
 CHANNELS = "20 MHz at 0, 90, 180, 270 deg, then 100 MHz at the same"
 _REACH = (0.05, 5.0)  # m, depths that a table-top rig can see; the networks take others for holes
@@ -26,12 +38,13 @@ _HARMONIC, _AGREEMENT, _WITHIN = 0.3, 0.5, 0.5
 
 @dataclass(frozen=True)
 class RawInput:
-    """A burst and what is needed to decode it: raw (F, 8, H, W), sensor temperatures (F,), camera, intrinsics."""
+    """A burst and what is needed to decode it: raw (F, 8, H, W), sensor temperatures (F,), camera, intrinsics; what was assumed."""
 
     raw: NDArray[Any]
     celsius: NDArray[np.float64]
     info: TofInfo
     camera: Camera
+    assumed: str = ""
 
 
 def read_input(path: Path, view: int = 0, rig: Path | None = None) -> RawInput:
@@ -45,7 +58,8 @@ def read_input(path: Path, view: int = 0, rig: Path | None = None) -> RawInput:
     view
         Of a shard.
     rig
-        ``rig.toml`` for an array; without it, nominal intrinsics and no range correction.
+        ``rig.toml`` for an array; without it, nominal intrinsics, and no range errors or :data:`NOMINAL_RANGE_ERRORS`, whichever the
+        two frequencies agree with; ``assumed`` says which.
 
     Raises
     ------
@@ -75,15 +89,37 @@ def _from_npy(path: Path, rig_path: Path | None) -> RawInput:
     rig = load_rig(rig_path) if rig_path else None
     camera = rig.tof if rig else NOMINAL_CAMERA
     _check_shape(raw, camera, path)
-    info = TofInfo(
-        model="array",
-        serial="",
-        camera=camera,
-        illuminator=rig.illuminator if rig else np.zeros(3),
-        range_errors=rig.range_errors if rig else (),
-    )
-    check_taps(raw.mean(axis=0, dtype=np.float64), info, str(path))
-    return RawInput(raw, np.full(len(raw), np.nan), info, camera)
+    mean = raw.mean(axis=0, dtype=np.float64)
+    celsius = np.full(len(raw), np.nan)
+    if rig:
+        info = _array_info(camera, rig.illuminator, rig.range_errors)
+        check_taps(mean, info, str(path))
+        return RawInput(raw, celsius, info, camera)
+    return _without_rig(raw, mean, celsius, path)
+
+
+def _array_info(
+    camera: Camera, illuminator: NDArray[np.float64], range_errors: tuple[RangeError, ...]
+) -> TofInfo:
+    return TofInfo("array", "", camera, illuminator, range_errors=range_errors)
+
+
+def _without_rig(
+    raw: NDArray[Any], mean: NDArray[np.float64], celsius: NDArray[np.float64], path: Path
+) -> RawInput:
+    """Take a camera that corrects its ranges itself, or else the sensor of :data:`NOMINAL_RANGE_ERRORS`, as the data say."""
+    words = "nominal intrinsics of 240 x 180 pixels, "
+    plain = _array_info(NOMINAL_CAMERA, np.zeros(3), ())
+    try:
+        check_taps(mean, plain, str(path))
+    except DataError as err:
+        known = _array_info(NOMINAL_CAMERA, np.zeros(3), NOMINAL_RANGE_ERRORS)
+        try:
+            check_taps(mean, known, str(path))
+        except DataError:
+            raise err from None
+        return RawInput(raw, celsius, known, NOMINAL_CAMERA, words + "range errors of a known sensor")
+    return RawInput(raw, celsius, plain, NOMINAL_CAMERA, words + "no range errors")
 
 
 def _check_shape(raw: NDArray[Any], camera: Camera, path: Path) -> None:
