@@ -41,7 +41,8 @@ from tofcapture_model.report.panels import mask_indices, nice_limit
 from tofcapture_model.report.pictures import NO_VALUE, Scale, indexed_png, palette, rgb_png
 from tofcapture_model.report.rigs import origin_of_alignment, transforms
 from tofcapture_model.report.scores import headline, tables
-from tofcapture_model.report.training import loss_chart, read_metrics
+from tofcapture_model.report.training import loss_chart
+from tofcapture_model.runlog import read_metrics
 from tofcapture_model.zoo import build_model
 
 CAMERA = Camera(64, 48, 50.0, 52.0, 31.0, 24.5)

@@ -10,6 +10,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from tests.stations import HALF_SIZE_STEREO
 from tests.test_model_training import make_dataset
 from tofcapture.camera import Camera
 from tofcapture.cli import main
@@ -51,13 +52,6 @@ harmonics = [[3, 0.012, -0.008]]
 modulation_hz = 75e6
 offset = 0.31
 harmonics = [[3, -0.005, 0.002], [6, 0.001, 0.0]]
-[sim.stereo]
-width = 640
-height = 512
-fx = 577.5
-fy = 577.5
-cx = 319.5
-cy = 255.5
 """
 
 
@@ -116,7 +110,7 @@ def stand_in(folder):
 @pytest.mark.slow
 def test_fine_tuning_to_a_second_sensor_beats_the_weights_it_started_from(tmp_path):
     """Four scenes of another camera, one of them held out: depth and normals of that one are better after a few minutes."""
-    (tmp_path / "station.toml").write_text(DEFAULT.read_text() + SECOND)
+    (tmp_path / "station.toml").write_text(DEFAULT.read_text() + SECOND + HALF_SIZE_STEREO)
     dataset = tmp_path / "dataset"
     simulate = [
         "simulate-dataset",

@@ -340,7 +340,13 @@ def test_the_paper_s_stages_run_in_order(dataset, tiny, tmp_path):
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert rows[0]["stage"] == "depth"
     assert sum(rows[0]["winners"]) == 3
-    assert load_resume(tmp_path / "run" / "resume.safetensors")[2]["stage"] == 3
+    state = load_resume(tmp_path / "run" / "resume.safetensors")[2]
+    assert state["stage"] == 3
+    last = {row["stage"]: row["seconds"] for row in rows if "seconds" in row}
+    assert state["before"] >= sum(
+        last.values()
+    )  # the clock starts anew with each stage; the run's minutes are all of them
+    assert load_model(tmp_path / "run")[2]["minutes"] == round(state["before"] / 60, 2)
 
 
 def test_a_time_budget_ends_a_run(dataset, tiny, tmp_path):

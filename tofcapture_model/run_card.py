@@ -11,13 +11,14 @@ from typing import Any
 import torch
 
 from tofcapture.errors import TofError
+from tofcapture.files.layout import SPLITS
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.seal import write_text
 from tofcapture.files.shard import ShardReader
 from tofcapture_model.config import Config, config_to_dict, preset, presets
+from tofcapture_model.runlog import read_metrics
 from tofcapture_model.zoo import Model
 
-SPLITS = ("train", "val", "test")
 ROWS = 12  # of a curve
 _TRUNCATE = 12  # digits of a digest that are enough to recognise it
 
@@ -40,17 +41,16 @@ def write_card(
     config, model, dataset, device
         What was trained, on what, where.
     provenance
-        What is known of the run: ``steps``, ``losses``, ``manifest_sha256``, where it started.
+        What is known of the run: ``steps``, ``minutes``, ``losses``, ``manifest_sha256``, where it started.
     minutes
         The budget that the run was given; ``None``: its epochs.
 
     Returns
     -------
-    What the checkpoint should remember beside ``provenance``: ``minutes`` of training, ``device``, ``torch``.
+    What the checkpoint should remember beside ``provenance``: ``device``, ``torch``.
     """
-    rows = read_metrics(out)
+    rows = read_metrics(Path(out) / "metrics.jsonl")
     facts = {
-        "minutes": round(trained_minutes(rows, int(provenance.get("steps", 0))), 2),
         "device": device_name(device),
         "torch": torch.__version__,
     }
@@ -66,52 +66,9 @@ def write_card(
     return facts
 
 
-def budget(weights: Path, provenance: Mapping[str, Any]) -> dict[str, float]:
-    """Minutes and steps that trained a checkpoint, by its provenance, or by ``metrics.jsonl`` beside it; what is not known is left out."""
-    steps = provenance.get("steps")
-    minutes = provenance.get("minutes") or trained_minutes(
-        read_metrics(Path(weights).parent), int(steps or 0)
-    )
-    found = {"minutes": minutes, "steps": steps}
-    return {key: float(value) for key, value in found.items() if value}
-
-
-def read_metrics(out: Path) -> list[dict[str, Any]]:
-    """Rows of ``metrics.jsonl``, by step; of steps that were done again after a kill, the later ones. Empty without the file."""
-    path = Path(out) / "metrics.jsonl"
-    if not path.exists():
-        return []
-    rows: dict[tuple[int, bool], dict[str, Any]] = {}
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:  # cut by a kill
-            continue
-        rows[row["step"], "total" in row] = row
-    return [rows[key] for key in sorted(rows, key=lambda k: (k[0], not k[1]))]
-
-
-def trained_minutes(rows: Sequence[Mapping[str, Any]], steps: int) -> float:
-    """Minutes of training over all stages: the clock of each stage's last logged step, and its pace for the steps after that.
-
-    Parameters
-    ----------
-    rows
-        Of ``metrics.jsonl``.
-    steps
-        Of the whole run.
-    """
-    logged = [row for row in rows if "seconds" in row]
-    total = 0.0
-    for i, row in enumerate(logged):
-        last = i + 1 == len(logged)
-        if not last and logged[i + 1]["stage"] == row["stage"]:
-            continue
-        after = (steps if last else logged[i + 1]["step"] - 1) - row["step"]
-        before = logged[i - 1] if i and logged[i - 1]["stage"] == row["stage"] else row
-        pace = (row["seconds"] - before["seconds"]) / max(row["step"] - before["step"], 1)
-        total += row["seconds"] + pace * max(after, 0)
-    return total / 60
+def budget(provenance: Mapping[str, Any]) -> dict[str, float]:
+    """Minutes and steps that trained a checkpoint, by its provenance; what is not known is left out."""
+    return {key: float(provenance[key]) for key in ("minutes", "steps") if provenance.get(key)}
 
 
 def device_name(device: torch.device) -> str:

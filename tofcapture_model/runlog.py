@@ -24,6 +24,8 @@ class Position:
         Steps done, over all stages.
     elapsed
         Seconds of training in this stage, over all sittings.
+    before
+        Seconds of the stages before this one.
     """
 
     stage: int = 0
@@ -31,6 +33,21 @@ class Position:
     batch: int = 0
     step: int = 0
     elapsed: float = 0.0
+    before: float = 0.0
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Rows of a ``metrics.jsonl`` by step; a line that a kill cut short is skipped, of two for a step the later counts."""
+    if not path.is_file():
+        return []
+    rows: dict[tuple[int, bool], dict[str, Any]] = {}
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            row = json.loads(line)
+            rows[int(row["step"]), "total" in row] = row
+        except (ValueError, KeyError, TypeError):
+            continue
+    return [rows[key] for key in sorted(rows)]
 
 
 class Log:

@@ -236,7 +236,7 @@ def measure_runs(
         model, _, provenance = load_model(path)
         trained[f"{name}#{i}"] = {"weights": str(path), "training": provenance}
         row = measure(data, {name: _learned(model.to(place))}, place, part(nth))[name]
-        by_name.setdefault(name, []).append({**row, "budget": budget(path, provenance)})
+        by_name.setdefault(name, []).append({**row, "budget": budget(provenance)})
     data.close()
     table |= {name: averaged(found) for name, found in by_name.items()}
     return {

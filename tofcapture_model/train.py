@@ -198,11 +198,17 @@ def train(
                 every = config.training.validate_every
                 if rank == 0 and every and (_done(position, stage, budget) or position.epoch % every == 0):
                     log.validation(position, stage, _validate(model, dataset, place))
+            position.before += position.elapsed
             position.epoch, position.elapsed, moments = 0, 0.0, {}
         position.stage = len(config.stages)
         data.close()
         if rank == 0:
-            provenance: dict[str, Any] = {**source, "steps": position.step, "losses": losses}
+            provenance: dict[str, Any] = {
+                **source,
+                "steps": position.step,
+                "minutes": round(position.before / 60, 2),
+                "losses": losses,
+            }
             if isinstance(model, JointModel) and config.losses.uncertainty == "laplace":
                 provenance["uncertainty"] = calibrate(model, dataset, place)
             provenance |= write_card(out, config, model, dataset, place, provenance, minutes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from tofcapture.errors import ConfigError
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.config import Config, dumps_config
+from tofcapture_model.runlog import read_metrics
 from tofcapture_model.zoo import Model
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM = 640, 220, 56, 34
@@ -84,20 +84,6 @@ def load_network(weights: Path | None) -> tuple[Network | None, str]:
     count = sum(p.numel() for p in model.parameters())
     rows = read_metrics(path.parent / "metrics.jsonl")
     return Network(model, config, provenance, path.name, sha256_of(path), count, rows, weights is None), ""
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Rows of a ``metrics.jsonl`` by step; a line that a kill cut short is skipped, of two for a step the later counts."""
-    if not path.is_file():
-        return []
-    rows: dict[tuple[int, bool], dict[str, Any]] = {}
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        try:
-            row = json.loads(line)
-            rows[int(row["step"]), "total" in row] = row
-        except (ValueError, KeyError, TypeError):
-            continue
-    return [rows[key] for key in sorted(rows)]
 
 
 def loss_chart(rows: Sequence[Mapping[str, Any]]) -> Chart | None:
