@@ -10,8 +10,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from tests.analytic import make_dataset
 from tests.stations import HALF_SIZE_STEREO
-from tests.test_model_training import make_dataset
 from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.devices.station import DEFAULT

@@ -16,9 +16,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from tests.analytic import make_dataset
 from tests.test_model_baselines import target
 from tests.test_model_networks import frame
-from tests.test_model_training import make_dataset
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError
 from tofcapture.files.cache import pack

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from tofcapture.camera import Camera
-from tofcapture.errors import DataError
+from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.packed import PackedScene
 from tofcapture.files.shard import ShardReader
@@ -26,6 +27,7 @@ from tofcapture_model.multipath import cues
 from tofcapture_model.shards import SampleId, all_samples, open_scenes
 
 Float32 = NDArray[np.float32]
+MODEST = 1.5e9  # bytes, where the system does not tell what it has
 MAX_RANGE = 5.0  # m; a decoded depth beyond it is an unwrapping failure on this rig and counts as a hole
 
 
@@ -137,7 +139,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
     Parameters
     ----------
     folder
-        The dataset.
+        The dataset, or several.
     split
         ``train``, ``val`` or ``test``.
     size
@@ -151,14 +153,14 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
     mean
         One item per view: the mean of its frames, for noise that is drawn again (:func:`tofcapture_model.augment.redraw_frame`).
     cache_bytes
-        Decoded frames are kept in memory up to this size.
+        Decoded frames and their ground truth are kept in memory up to this size: decoding anew takes as long as training on it.
     cache
-        Folder that ``tofcapture pack`` filled with this split; ``None`` reads the shards.
+        Folder that ``tofcapture pack`` filled with this split of the one dataset; ``None`` reads the shards.
     """
 
     def __init__(
         self,
-        folder: Path,
+        folder: Path | Sequence[Path],
         split: str,
         size: Sequence[int] = (),
         *,
@@ -166,17 +168,30 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         seed: int = 0,
         frames: int = 0,
         mean: bool = False,
-        cache_bytes: float = 1.5e9,
+        cache_bytes: float = 0,
         cache: Path | None = None,
     ) -> None:
-        self.readers = open_scenes(folder, split, cache)
-        self.size, self.flip, self.seed, self.cache_bytes = tuple(size), flip, seed, cache_bytes
+        folders = folder if isinstance(folder, Sequence) else [folder]
+        if cache and len(folders) > 1:
+            raise ConfigError(
+                f"expected one dataset with the cache {cache}, got {len(folders)}",
+                hint="leave the cache away: frames are kept in memory as far as it goes",
+            )
+        self.readers = {
+            f"{name} ({k + 1})" if k else name: reader  # datasets may use a name twice
+            for k, one in enumerate(folders)
+            for name, reader in open_scenes(one, split, cache).items()
+        }
+        self.size, self.flip, self.seed = tuple(size), flip, seed
         self.samples = all_samples(self.readers, 1 if mean else frames)
         self.mean, self.averaged = mean, _averaged(self.readers.values(), frames) if mean else 1
         if not self.samples:
             raise DataError(
-                f"{folder}: the split {split} is empty", hint="record more scenes, or choose another --split"
+                f"{', '.join(map(str, folders))}: the split {split} is empty",
+                hint="record more scenes, or choose another --split",
             )
+        _expect_alike(self.readers, self.size)
+        self._room = cache_bytes
         self._frames: dict[SampleId, Frame] = {}
         self._targets: dict[tuple[str, int], Target] = {}
         self._decoders: dict[str, Decoder] = {}
@@ -206,7 +221,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
             self._decoders[sample.scene] = frame_decoder(reader.info, reader.camera)
         raw: NDArray[Any] = np.stack([reader.raw(sample.view, f) for f in taken]).mean(0, dtype=np.float32)
         frame = make_frame(raw, reader.info, reader.camera, celsius, self._decoders[sample.scene])
-        if (len(self._frames) + 1) * sum(x.nbytes for x in frame) < self.cache_bytes:
+        if self._take_room(frame):
             self._frames[sample] = frame
         return frame
 
@@ -217,9 +232,16 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
             return self._targets[key]
         gt = self.readers[sample.scene].ground_truth(sample.view, 2)
         target = make_target(gt.depth, gt.normals, gt.mask)
-        if (len(self._targets) + 1) * sum(x.nbytes for x in target) < self.cache_bytes:
+        if self._take_room(target):
             self._targets[key] = target
         return target
+
+    def _take_room(self, tensors: Iterable[Tensor]) -> bool:
+        size = sum(x.nbytes for x in tensors)
+        if size > self._room:
+            return False
+        self._room -= size
+        return True
 
     def _cropped(self, frame: Frame, target: Target, rng: np.random.Generator) -> tuple[Frame, Target]:
         """Crop about a pixel of good ground truth, because most of an image is background."""
@@ -236,6 +258,38 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         """Close the shards."""
         for reader in self.readers.values():
             reader.close()
+
+
+def _expect_alike(readers: Mapping[str, ShardReader | PackedScene], size: tuple[int, ...]) -> None:
+    """Refuse frames that make no batch: other numbers of phases, other sizes unless crops of ``size`` fit into all."""
+    kinds: dict[tuple[int, ...], str] = {}
+    for name, reader in readers.items():
+        camera = reader.camera
+        shape = [min(n, s) for n, s in zip(camera.shape, size or camera.shape, strict=True)]
+        kinds.setdefault((len(reader.info.modulation_hz), *shape), f"{name}, {_size(reader)}")
+    if len(kinds) > 1:
+        raise DataError(
+            f"expected frames of one kind, got {' and '.join(kinds.values())}",
+            hint="train on them apart, or with a training.crop that fits into all",
+        )
+
+
+def _size(reader: ShardReader | PackedScene) -> str:
+    return " x ".join(map(str, (len(reader.info.modulation_hz), *reader.camera.shape)))
+
+
+def spare_memory(processes: int = 1) -> float:
+    """Bytes that decoded frames may take: half of what system and container have to spare, shared by ``processes``."""
+    try:
+        told = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        spare = 1024.0 * int(told["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        return MODEST / processes
+    group = Path("/sys/fs/cgroup")
+    with suppress(OSError, ValueError):  # no limit reads "max"
+        limit = int((group / "memory.max").read_text())
+        spare = min(spare, limit - int((group / "memory.current").read_text()))
+    return max(spare, 0.0) / 2 / processes
 
 
 def _averaged(readers: Iterable[ShardReader | PackedScene], frames: int) -> int:

@@ -85,7 +85,7 @@ def calibrate(model: JointModel, dataset: Path, device: torch.device) -> dict[st
     if not load_manifest(dataset).split("val"):
         model.error_map.calibration.mul_(LAPLACE_SIGMA)
         return {"factor": float(model.error_map.calibration), "views": 0}
-    data = FrameDataset(dataset, "val", frames=1, cache_bytes=0)
+    data = FrameDataset(dataset, "val", frames=1)
     model.eval()
     # Twice: the refinement weighs by the error map, so that the depth moves a little with the factor.
     for _ in range(2):
@@ -145,7 +145,7 @@ def evaluate(
     """
     model, config, provenance = load_model(weights)
     model.to(device)
-    data = FrameDataset(dataset, split, frames=frames, cache_bytes=0)
+    data = FrameDataset(dataset, split, frames=frames)
     methods: dict[str, Method] = {"sensor": sensor.estimate, "model": model_method(model)}
     scores, empty = score(methods, data, torch.device(device), progress)
     reader = next(iter(data.readers.values()))

@@ -121,6 +121,8 @@ def _data(dataset: Path, known: Mapping[str, Any]) -> str:
             (split, f"{len(entries)}", f"{views}", _frames([dataset / e.path for e in entries.values()]))
         )
     said = f"`{dataset}`, sha256 of its manifest {known.get('manifest_sha256', 'unknown')}"
+    for other, digest in known.get("also", {}).items():
+        said += f"; the split train of `{other}`, {digest}, was learned from, too"
     return f"{said}\n\n{_table(('split', 'scenes', 'views', 'frames'), rows)}"
 
 
@@ -201,7 +203,8 @@ def _thinned(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 
 def _commands(out: Path, dataset: Path, known: Mapping[str, Any], minutes: float | None) -> str:
-    again = f"tofcapture train {dataset} --out {out}.again --config {out}/model.toml"
+    datasets = " ".join([str(dataset), *known.get("also", {})])
+    again = f"tofcapture train {datasets} --out {out}.again --config {out}/model.toml"
     again += f" --from {known['start']}" if "start" in known else ""
     again += f" --minutes {minutes:g}" if minutes else ""
     return (

@@ -217,7 +217,7 @@ def measure_runs(
     runs = [(name, i, find_model(path)) for name, paths in weights.items() for i, path in enumerate(paths)]
     for _, _, path in runs:
         load_model(path)  # says what is wrong with it, before hours of measuring
-    data = FrameDataset(dataset, split, frames=frames, cache_bytes=0)
+    data = FrameDataset(dataset, split, frames=frames)
     data.samples = [s for s in data.samples if s.scene.startswith(scenes)]
     if not data.samples:
         raise ConfigError(

@@ -7,7 +7,7 @@ import math
 import os
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,7 +30,7 @@ from tofcapture_model.checkpoint import (
     save_resume,
 )
 from tofcapture_model.config import Config, Stage, dumps_config
-from tofcapture_model.data import FrameDataset, collate, epoch_batches
+from tofcapture_model.data import FrameDataset, collate, epoch_batches, spare_memory
 from tofcapture_model.evaluate import calibrate, model_method, score
 from tofcapture_model.frame import Estimate, frame_to, target_to
 from tofcapture_model.joint import JointModel
@@ -78,6 +78,7 @@ def train(
     workers: int = 0,
     cache: Path | None = None,
     start: Path | None = None,
+    also: Sequence[Path] = (),
     report: Callable[[str, float, str], None] = lambda _what, _done, _text: None,
 ) -> Trained:
     """Train all stages of a configuration on the ``train`` split of a dataset.
@@ -101,11 +102,13 @@ def train(
     device
         Torch device; under ``torchrun`` with CUDA each process takes its own.
     workers
-        Processes that read data; 0 keeps decoded frames in memory, best for small datasets.
+        Processes that read data; 0 keeps decoded frames in memory, up to half of what is free: best where they fit.
     cache
         Folder that ``tofcapture pack`` filled with the ``train`` split; ``None`` reads the shards.
     start
         Checkpoint to start from instead of random weights (fine-tuning); its network must be the configuration's.
+    also
+        Further datasets whose ``train`` splits are learned from; validation stays with the first.
     report
         Called with (stage, fraction done, one line of text).
 
@@ -115,14 +118,17 @@ def train(
     """
     if epochs is not None:
         config = replace(config, stages=tuple(replace(s, epochs=epochs) for s in config.stages))
-    load_manifest(dataset)  # says what is wrong with it, before anything is started
+    for each in (dataset, *also):
+        load_manifest(each)  # says what is wrong with it, before anything is started
     with _processes() as (rank, world):
         place = torch.device(
             f"cuda:{os.environ['LOCAL_RANK']}" if world > 1 and torch.cuda.is_available() else device
         )
         torch.manual_seed(config.training.seed)
         model = build_model(config).to(place)
-        source = {"dataset": str(dataset), "manifest_sha256": sha256_of(Path(dataset) / "manifest.json")}
+        source: dict[str, Any] = {"dataset": str(dataset), "manifest_sha256": _digest(dataset)}
+        if also:
+            source["also"] = {str(d): _digest(d) for d in also}  # and the digests of their manifests
         if start is not None:
             source |= {"start": str(start), "start_sha256": _begin_with(model, config, start)}
         key = _key(config, source, minutes)
@@ -130,14 +136,14 @@ def train(
         if position.stage == len(config.stages):
             return Trained(out / "model.safetensors", position.step, finished=True, losses={})
         data = FrameDataset(
-            dataset,
+            [dataset, *also],
             "train",
             config.training.crop,
             flip=config.training.flip,
             seed=config.training.seed,
             frames=config.training.frames,
             mean=config.training.noise == "drawn",
-            cache_bytes=0 if workers else 1.5e9,
+            cache_bytes=0 if workers else spare_memory(int(os.environ.get("LOCAL_WORLD_SIZE", "1"))),
             cache=cache,
         )
         log = Log(out if rank == 0 else None)
@@ -246,9 +252,13 @@ def _begin_with(model: Model, config: Config, start: Path) -> str:
     return sha256_of(find_model(start))
 
 
-def _key(config: Config, source: Mapping[str, str], minutes: float | None) -> str:
+def _digest(dataset: Path) -> str:
+    return sha256_of(Path(dataset) / "manifest.json")
+
+
+def _key(config: Config, source: Mapping[str, Any], minutes: float | None) -> str:
     """Digest of all that decides what a run computes; a resume point of another run is refused."""
-    begun = source.get("start_sha256", "")
+    begun = source.get("start_sha256", "") + "".join(source.get("also", {}).values())
     text = f"{dumps_config(config)}|{source['manifest_sha256']}|{minutes}{begun}"
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -321,7 +331,7 @@ def _validate(model: Model, dataset: Path, place: torch.device) -> dict[str, flo
     """MAE (m) and mean angle (deg) on the first frames of the ``val`` split; empty where there is no such split."""
     if not load_manifest(dataset).split("val"):
         return {}
-    data = FrameDataset(dataset, "val", frames=1, cache_bytes=0)
+    data = FrameDataset(dataset, "val", frames=1)
     model.eval()
     table = score({"model": model_method(model)}, data, place)[0]["model"].table()
     model.train()

@@ -17,6 +17,7 @@ from tofcapture_model.neighbours import Found
 
 _PARTS = 16  # of the queries
 _RUN = 4  # leaves that stay together
+_WORTH_A_THREAD = 10_000  # queries of one shift
 _MARGIN = 1e-6  # of the largest coordinate: rounding of a shifted query
 
 
@@ -106,8 +107,8 @@ class _Shift:
 class _Crew:
     """Threads that ask; the answers and their sums do not depend on how many there are."""
 
-    def __init__(self) -> None:
-        self.size = torch.get_num_threads()
+    def __init__(self, queries: int) -> None:
+        self.size = min(torch.get_num_threads(), 1 + queries // _WORTH_A_THREAD)
         self.pool = ThreadPoolExecutor(self.size) if self.size > 1 else None
 
     def ask(self, shifts: Sequence[_Shift], first: int, last: int) -> None:
@@ -134,6 +135,10 @@ def _plan(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) 
     return [_Shift(trees, shift, shape) for shift in shifts.tolist()]
 
 
+def _queries(plans: Sequence[_Shift]) -> int:
+    return sum(len(tree.pixels) for tree in plans[0].trees)
+
+
 @torch.no_grad()
 def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> list[Found]:
     """Find the nearest neighbours of every p + s in Q and of every q in P + s, exactly.
@@ -152,7 +157,7 @@ def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor
     One Found per shift
     """
     plans = _plan(p, q, p_mask, q_mask, shifts)
-    with _Crew() as crew:
+    with _Crew(_queries(plans)) as crew:
         crew.ask(plans, 0, _PARTS)
     return [plan.found() for plan in plans]
 
@@ -170,7 +175,7 @@ def nearest_of_best(
     index of the shift, its Found, (S,) m^2: its distance, and for every other shift a bound from below that is not less
     """
     plans = _plan(p, q, p_mask, q_mask, shifts)
-    with _Crew() as crew:
+    with _Crew(_queries(plans)) as crew:
         crew.ask(plans, 0, 1)
         best, *others = sorted(plans, key=_Shift.seen)
         crew.ask([best], 1, _PARTS)

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from tofcapture.compiled import compiled
 
 Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 Point = tuple[np.float32, np.float32, np.float32]
 
 FAN = 16
-_ZERO, _INF, _ONE = np.float32(0), np.float32(np.inf), np.uint32(1)
+_ZERO, _INF, _ONE, _TINY = np.float32(0), np.float32(np.inf), np.uint32(1), np.float32(1e-12)
+_ALIKE = np.float32(4)  # times the mean square of the others: farther away than that, a query looks alone
 _FACTOR, _TOP = (
     np.uint32(0x077CB531),
     np.uint32(27),
@@ -103,15 +105,15 @@ def _points_within(leaves: Float32, g: int, p: Point, s: Point, squared: np.floa
 
 
 @compiled
-def _apart(leaves: Float32, i: int, p: Point, s: Point) -> np.float32:
-    """Squared distance of p + s to point i; the shift is taken from the difference, where it rounds least."""
-    g, k = i // FAN, i % FAN
-    dx, dy, dz = (
-        (leaves[g, 0, k] - p[0]) - s[0],
-        (leaves[g, 1, k] - p[1]) - s[1],
-        (leaves[g, 2, k] - p[2]) - s[2],
-    )
-    return dx * dx + dy * dy + dz * dz  # type: ignore[no-any-return]
+def _between(p: Point, q: Point, s: Point) -> np.float32:
+    """Squared distance of p and q + s; the shift is taken from the difference, where it rounds least."""
+    dx, dy, dz = (p[0] - q[0]) - s[0], (p[1] - q[1]) - s[1], (p[2] - q[2]) - s[2]
+    return dx * dx + dy * dy + dz * dz
+
+
+@compiled
+def _point(leaves: Float32, g: int, k: int) -> Point:
+    return leaves[g, 0, k], leaves[g, 1, k], leaves[g, 2, k]
 
 
 @compiled
@@ -127,7 +129,7 @@ def _look(leaves: Float32, g: int, p: Point, s: Point, best: np.float32, at: int
     while bits:
         i = FAN * g + _lowest(bits)
         bits &= bits - _ONE
-        squared = _apart(leaves, i, p, s)
+        squared = _between(_point(leaves, i // FAN, i % FAN), p, s)
         if squared < best:
             best, at = squared, i
     return best, at
@@ -176,6 +178,112 @@ def _descend(
 
 
 @compiled
+def _boxes_near(boxes: Float32, g: int, low: Point, high: Point, squared: np.float32) -> np.uint32:
+    """Bits of those of sixteen boxes that are nearer to the box from ``low`` to ``high`` than a squared distance."""
+    bits = np.uint32(0)
+    for k in range(FAN):
+        dx = max(boxes[g, 0, k] - high[0], low[0] - boxes[g, 3, k], _ZERO)
+        dy = max(boxes[g, 1, k] - high[1], low[1] - boxes[g, 4, k], _ZERO)
+        dz = max(boxes[g, 2, k] - high[2], low[2] - boxes[g, 5, k], _ZERO)
+        bits |= np.uint32(dx * dx + dy * dy + dz * dz < squared) << np.uint32(k)
+    return bits
+
+
+@compiled
+def _wanted(boxes: Float32, g: int, j: int, moved: Float32, best: Float32) -> bool:
+    """Whether box j of sixteen is nearer to any of sixteen queries (3, 16) than what that one has."""
+    x0, y0, z0 = boxes[g, 0, j], boxes[g, 1, j], boxes[g, 2, j]
+    x1, y1, z1 = boxes[g, 3, j], boxes[g, 4, j], boxes[g, 5, j]
+    count = 0
+    for k in range(FAN):
+        dx = max(x0 - moved[0, k], moved[0, k] - x1, _ZERO)
+        dy = max(y0 - moved[1, k], moved[1, k] - y1, _ZERO)
+        dz = max(z0 - moved[2, k], moved[2, k] - z1, _ZERO)
+        count += dx * dx + dy * dy + dz * dz < best[k]
+    return count > 0
+
+
+@compiled
+def _look_all(leaves: Float32, g: int, of: Float32, s: Point, best: Float32, at: Int32) -> np.float32:
+    """Let sixteen queries ``of`` (3, 16) + s look at a leaf; returns the largest squared distance that is left."""
+    for j in range(0, FAN, 4):  # four at a time: the least so far is a chain of dependent steps
+        p0, p1 = _point(leaves, g, j), _point(leaves, g, j + 1)
+        p2, p3 = _point(leaves, g, j + 2), _point(leaves, g, j + 3)
+        i0 = np.int32(FAN * g + j)
+        i1, i2, i3 = np.int32(i0 + 1), np.int32(i0 + 2), np.int32(i0 + 3)
+        for k in range(FAN):
+            q = (of[0, k], of[1, k], of[2, k])
+            d0, d1, d2, d3 = _between(p0, q, s), _between(p1, q, s), _between(p2, q, s), _between(p3, q, s)
+            a, b = i1 if d1 < d0 else i0, i3 if d3 < d2 else i2
+            da, db = min(d1, d0), min(d3, d2)
+            i, d = b if db < da else a, min(db, da)
+            at[k] = i if d < best[k] else at[k]
+            best[k] = min(d, best[k])
+    most = _ZERO
+    for k in range(FAN):
+        most = max(most, best[k])
+    return most
+
+
+@compiled
+def _reach(best: Float32, most: np.float32) -> np.float32:
+    """Squared distance within which sixteen queries look together: the largest of theirs, but for a few far above the others."""
+    for _ in range(4):
+        total, count = _ZERO, 0
+        for k in range(FAN):
+            below = best[k] <= most
+            total += best[k] if below else _ZERO
+            count += below
+        if most <= _ALIKE * total / np.float32(count):
+            break
+        most = _ALIKE * total / np.float32(count)
+    return most
+
+
+@compiled
+def _descend_all(
+    leaves: Float32, boxes: Float32, offsets: Int64, node: Int64, open_: NDArray[np.uint32], of: Float32, moved: Float32,
+    s: Point, low: Point, high: Point, first: int, reach: np.float32, best: Float32, at: Int32,
+) -> np.float32:  # fmt: skip
+    """Let sixteen queries, ``moved`` from ``low`` to ``high``, look at all leaves within reach; returns what reach was enough."""
+    levels = len(offsets) - 1
+    level = levels - 1
+    node[level], open_[level] = 0, _boxes_near(boxes, offsets[level], low, high, reach)
+    while level < levels:
+        bits = open_[level]
+        if bits == 0:
+            level += 1
+            continue
+        k = _lowest(bits)
+        open_[level] = bits & (bits - _ONE)
+        child = FAN * node[level] + k
+        if level > 0:
+            level -= 1
+            node[level], open_[level] = child, _boxes_near(boxes, offsets[level] + child, low, high, reach)
+        elif child != first and _wanted(boxes, node[0], k, moved, best):
+            reach = min(reach, _look_all(leaves, child, of, s, best, at))
+    return reach
+
+
+@compiled
+def _take(
+    own: Float32, g: int, count: int, s: Point, of: Float32, moved: Float32, best: Float32
+) -> tuple[Point, Point]:
+    """Fill ``of`` with the queries of a leaf, and ``moved`` with them + s; returns the box of these. Empty places hold the first."""
+    for k in range(FAN):
+        best[k] = _INF
+        for a in range(3):
+            of[a, k] = own[g, a, k if k < count else 0]
+            moved[a, k] = of[a, k] + s[a]
+    low, high = (moved[0, 0], moved[1, 0], moved[2, 0]), (moved[0, 0], moved[1, 0], moved[2, 0])
+    for k in range(1, FAN):
+        x, y, z = moved[0, k], moved[1, k], moved[2, k]
+        low = (min(low[0], x), min(low[1], y), min(low[2], z))
+        high = (max(high[0], x), max(high[1], y), max(high[2], z))
+    return low, high
+
+
+@compiled
 def search(
     leaves: Float32, boxes: Float32, offsets: Int64, names: Int64, own: Float32, own_names: Int64,
     shift: Point, parts: tuple[int, int, int], run: int, squared: Float32, index: Int64,
@@ -183,26 +291,50 @@ def search(
     """Nearest of the tree ``leaves, boxes, offsets`` to the points of leaves ``own`` + shift; returns the sum of squares, m^2.
 
     ``parts`` are first, last + 1 and how many there are: runs of so many leaves belong to the parts in turns. ``names`` and
-    ``own_names`` are the pixels of both clouds; ``squared`` and ``index`` (H W,) are written at those of the queries. A
-    query starts with the answer of the one before it, which is its neighbour on the grid.
+    ``own_names`` are the pixels of both clouds; ``squared`` and ``index`` (H W,) are written at those of the queries. The
+    queries of a leaf look together, first where the leaf before, their neighbour on the grid, had its answer; those that
+    are much farther away from everything than the others go on alone.
     """
     node, open_ = np.zeros(len(offsets), np.int64), np.zeros(len(offsets), np.uint32)
-    n, at, before, total = len(own_names), -1, _INF, 0.0
-    for i in range(n):
-        g, k = i // FAN, i % FAN
+    of, moved = np.empty((3, FAN), np.float32), np.empty((3, FAN), np.float32)
+    best, at = np.empty(FAN, np.float32), np.empty(FAN, np.int32)
+    n, there, before, total = len(own_names), -1, _INF, 0.0
+    for g in range(len(own)):
         part = (g // run) % parts[2]
         if part < parts[0] or part >= parts[1]:
-            at = -1
+            there = -1
             continue
-        p = (own[g, 0, k], own[g, 1, k], own[g, 2, k])
-        best = _INF
-        if at >= 0:
-            best, at = _look(leaves, at // FAN, p, shift, _apart(leaves, at, p, shift), at)
-        if at < 0 or best > FAN * before:  # across a depth step: look there first, lest much be nearer
-            there = _likeliest(boxes, offsets, p[0] + shift[0], p[1] + shift[1], p[2] + shift[2])
-            best, at = _look(leaves, there, p, shift, best, max(at, 0))
-        best, at = _descend(leaves, boxes, offsets, node, open_, p, shift, best, at)
-        before = best
-        squared[own_names[i]], index[own_names[i]] = best, names[at]
-        total += float(best)
+        count = min(FAN, n - FAN * g)
+        low, high = _take(own, g, count, shift, of, moved, best)
+        first, most = there, _INF
+        if there >= 0:
+            most = _look_all(leaves, there, of, shift, best, at)
+        if there < 0 or most > FAN * before:  # across a depth step: look there first, lest much be nearer
+            first = _likeliest(boxes, offsets, moved[0, 0], moved[1, 0], moved[2, 0])
+            most = _look_all(leaves, first, of, shift, best, at)
+        reach = _descend_all(
+            leaves,
+            boxes,
+            offsets,
+            node,
+            open_,
+            of,
+            moved,
+            shift,
+            low,
+            high,
+            first,
+            _reach(best, most),
+            best,
+            at,
+        )
+        for k in range(count):
+            near, whose = best[k], int(at[k])
+            if near > reach:
+                point = (of[0, k], of[1, k], of[2, k])
+                near, whose = _descend(leaves, boxes, offsets, node, open_, point, shift, near, whose)
+            name = own_names[FAN * g + k]
+            squared[name], index[name] = near, names[whose]
+            total += float(near)
+        there, before = int(at[FAN // 2]) // FAN, max(reach, _TINY)
     return total

@@ -1,0 +1,165 @@
+"""Frames of datasets as networks read them: items, crops, mirrors, order, memory, several datasets at once."""
+
+# ruff: noqa: E402  torch is optional
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from tests.analytic import make_dataset
+from tofcapture.cli import main
+from tofcapture.errors import ConfigError, DataError
+from tofcapture.files.seal import sha256_of
+from tofcapture_model import data as module
+from tofcapture_model.checkpoint import load_model
+from tofcapture_model.data import FrameDataset, SampleId, collate, epoch_batches, mirror, spare_memory
+from tofcapture_model.geometry import depth_to_normals, scale_intrinsics
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """Two training scenes and a test scene at half the sensor's resolution."""
+    return make_dataset(tmp_path_factory.mktemp("data") / "dataset", scale=2)
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory):
+    """One more training scene, with a name that the first dataset has, too."""
+    return make_dataset(
+        tmp_path_factory.mktemp("data") / "other", views=2, scale=2, splits=("train",), seed=5
+    )
+
+
+def test_items_line_up_with_the_camera(dataset):
+    """Depth and doubled ground truth of the same item agree up to noise; the crop moves the principal point."""
+    data = FrameDataset(dataset, "train", (48, 64), seed=1)
+    frame, target = data[(0, 0)]
+    assert frame.depth.shape == (1, 48, 64)
+    assert target.depth.shape == (1, 96, 128)
+    coarse = torch.nn.functional.avg_pool2d(target.depth, 2)
+    inside = torch.nn.functional.avg_pool2d((target.good | target.context).float(), 2) == 1
+    assert (frame.depth - coarse)[inside].abs().median() < 0.012
+    assert frame.intrinsics[2] <= data.readers["scene-0"].camera.cx
+
+
+def test_items_depend_on_epoch_and_index_only(dataset):
+    """The same key gives the same crop, whoever asks; another epoch gives another."""
+    first, second = (FrameDataset(dataset, "train", (48, 64), flip=True, seed=1) for _ in range(2))
+    second[(5, 3)]
+    assert torch.equal(first[(2, 1)][0].depth, second[(2, 1)][0].depth)
+    assert not torch.equal(first[(2, 1)][0].depth, first[(3, 1)][0].depth)
+
+
+@pytest.mark.parametrize("axis", [-1, -2])
+def test_mirroring_twice_is_the_identity_and_keeps_the_geometry(dataset, axis):
+    """A mirrored frame is one of a mirrored world: plane fits of the mirrored depth are the mirrored normals."""
+    data = FrameDataset(dataset, "train")
+    frame, target = data[(0, 0)]
+    once = mirror(frame, target, axis)
+    twice = mirror(*once, axis)
+    assert all(torch.allclose(a, b) for a, b in zip(frame, twice[0], strict=True))
+    k = scale_intrinsics(once[0].intrinsics[None], 2)
+    fitted = depth_to_normals(once[1].depth[None], once[1].good[None].float() + 1e-6, k, radius=1)[0]
+    cosine = (fitted * once[1].normals).sum(0)[once[1].good[0]]
+    assert cosine.median() > 0.999
+
+
+def test_processes_share_an_epoch_without_overlap():
+    """Two ranks take different samples and equally many batches."""
+    one, two = (epoch_batches(21, 4, 0, 1, rank, 2) for rank in (0, 1))
+    assert len(one) == len(two) == 2
+    assert not {k for b in one for k in b} & {k for b in two for k in b}
+    assert len(epoch_batches(3, 4, 0, 0)) == 1
+
+
+def test_an_empty_split_is_an_error(dataset):
+    """There is no validation scene here."""
+    with pytest.raises(DataError, match="split val is empty"):
+        FrameDataset(dataset, "val")
+
+
+def test_whole_frames_and_crops_collate(dataset):
+    """Batches keep names, shapes and channels-last order."""
+    data = FrameDataset(dataset, "train", (48, 64))
+    frame, target = collate([data[(0, i)] for i in range(2)])
+    assert frame.raw.shape == (2, 8, 48, 64)
+    assert frame.raw.is_contiguous(memory_format=torch.channels_last)
+    assert target.good.dtype == torch.bool
+
+
+def test_frames_stay_in_memory_as_far_as_it_goes(dataset):
+    """What is kept is the very same object and takes no more than it may; what is not kept is the same bits."""
+    first = SampleId("scene-0", 0, 0)
+    size = sum(x.nbytes for x in FrameDataset(dataset, "train").frame(first))
+    data = FrameDataset(dataset, "train", cache_bytes=2.5 * size)
+    kept = [data.frame(s) for s in data.samples]
+    again = [data.frame(s) for s in data.samples]
+    assert [a is b for a, b in zip(kept, again, strict=True)] == [True, True] + [False] * (len(kept) - 2)
+    assert all(torch.equal(x, y) for a, b in zip(kept, again, strict=True) for x, y in zip(a, b, strict=True))
+
+
+def test_memory_is_what_system_and_container_spare(monkeypatch):
+    """Half of the smaller of the two, shared by the processes; a modest amount where neither is told."""
+    files = {"/proc/meminfo": "MemTotal: 64 kB\nMemAvailable: 32 kB\n"}
+
+    def read_text(path, *_args, **_kwargs):
+        if str(path) not in files:
+            raise FileNotFoundError(path)
+        return files[str(path)]
+
+    monkeypatch.setattr(Path, "read_text", read_text)
+    assert spare_memory() == 32 * 1024 / 2
+    assert spare_memory(4) == 32 * 1024 / 8
+    files |= {"/sys/fs/cgroup/memory.max": "20000\n", "/sys/fs/cgroup/memory.current": "4000\n"}
+    assert spare_memory() == 8000
+    files["/sys/fs/cgroup/memory.max"] = "max\n"
+    assert spare_memory() == 32 * 1024 / 2
+    files.clear()
+    assert spare_memory() == module.MODEST
+
+
+def test_several_datasets_are_one(dataset, other):
+    """Every frame of both, each with its own ground truth, though they share a scene's name."""
+    both = FrameDataset([dataset, other], "train")
+    one, two = FrameDataset(dataset, "train"), FrameDataset(other, "train")
+    assert len(both) == len(one) + len(two)
+    assert torch.equal(both[(0, len(one))][0].raw, two[(0, 0)][0].raw)
+    assert torch.equal(both[(0, len(one))][1].depth, two[(0, 0)][1].depth)
+    assert torch.equal(both[(0, 0)][0].raw, one[(0, 0)][0].raw)
+
+
+def test_datasets_that_do_not_go_together_are_refused(dataset, tmp_path):
+    """Whole frames of two sizes make no batch; crops do. One cache holds one dataset."""
+    smaller = make_dataset(tmp_path / "smaller", views=1, scale=4, splits=("train",))
+    with pytest.raises(DataError, match=r"8 x 90 x 120.*8 x 45 x 60"):
+        FrameDataset([dataset, smaller], "train")
+    FrameDataset([dataset, smaller], "train", (32, 32))
+    with pytest.raises(DataError, match=r"8 x 45 x 60"):
+        FrameDataset([dataset, smaller], "train", (64, 64))
+    with pytest.raises(ConfigError, match="one dataset with the cache"):
+        FrameDataset([dataset, smaller], "train", (32, 32), cache=tmp_path)
+
+
+def test_the_command_trains_on_several_datasets(dataset, other, tmp_path, capsys):
+    """The weights remember both; the card names both; another set of datasets does not continue the run."""
+    config = tmp_path / "tiny.toml"
+    config.write_text(
+        'preset = "demo"\nstage = [{name = "joint", epochs = 1, learning_rate = 1e-3}]\n'
+        "[network]\nwidth = 2\nlevels = 2\n[training]\nbatch = 4\ncrop = [32, 48]\n"
+    )
+    out = ["--config", str(config), "--out", str(tmp_path / "run"), "--json"]
+    assert main(["train", str(dataset), str(other), *out]) == 0
+    assert json.loads(capsys.readouterr().out)["steps"] == 4  # 12 + 4 frames by four
+    provenance = load_model(tmp_path / "run")[2]
+    assert provenance["dataset"] == str(dataset)
+    digest = sha256_of(other / "manifest.json")
+    assert provenance["also"] == {str(other): digest}
+    card = (tmp_path / "run/README.md").read_text()
+    assert digest in card
+    assert f"tofcapture train {dataset} {other} --out" in card
+    assert main(["train", str(dataset), *out]) == 3
+    assert "another configuration, dataset or budget" in capsys.readouterr().out
