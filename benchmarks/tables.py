@@ -125,7 +125,7 @@ def _train_all(args: argparse.Namespace, wanted: Mapping[str, Config]) -> dict[s
 def main() -> None:
     """Train what is missing, measure every run once, write the tables."""
     args = _arguments()
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: idle threads sleep
+    os.environ.setdefault("GOMP_SPINCOUNT", "2000")  # before torch: idle threads soon sleep
     import torch
 
     from tofcapture_model.suite import FREE, measure_runs, read_weights, write_suite

@@ -18,9 +18,9 @@ def double_conv(inputs: int, outputs: int) -> nn.Sequential:
     """Two 3 x 3 convolutions with ReLU."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, padding=1),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.Conv2d(outputs, outputs, 3, padding=1),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
     )
 
 
