@@ -139,8 +139,9 @@ def test_the_torch_search_finds_the_same_distances(pair):
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
-def test_threads_change_nothing(threads):
+def test_threads_change_nothing(threads, monkeypatch):
     """The winner, its neighbours and every bound are the same bits whatever the number of threads."""
+    monkeypatch.setattr(trees, "_WORTH_A_THREAD", 100)
     rng = np.random.default_rng(0)
     camera = torch.tensor([[40.0, 43.0, 30.0, 20.0]])
     p, q = (unproject(depths("stepped", (48, 64), rng)[None, None], camera)[0] for _ in range(2))
