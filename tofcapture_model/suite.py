@@ -18,7 +18,7 @@ from tofcapture.errors import ConfigError
 from tofcapture_model.baselines import lf2, sensor
 from tofcapture_model.baselines.protocol import Baseline
 from tofcapture_model.checkpoint import find_model, load_model
-from tofcapture_model.data import FrameDataset, batched
+from tofcapture_model.data import FrameDataset, batched, spare_memory
 from tofcapture_model.evaluate import write_results
 from tofcapture_model.frame import Frame, Target, frame_to, target_to
 from tofcapture_model.measures import Precision, Uncertainty, regions
@@ -217,7 +217,7 @@ def measure_runs(
     runs = [(name, i, find_model(path)) for name, paths in weights.items() for i, path in enumerate(paths)]
     for _, _, path in runs:
         load_model(path)  # says what is wrong with it, before hours of measuring
-    data = FrameDataset(dataset, split, frames=frames)
+    data = FrameDataset(dataset, split, frames=frames, cache_bytes=spare_memory())  # every run asks again
     data.samples = [s for s in data.samples if s.scene.startswith(scenes)]
     if not data.samples:
         raise ConfigError(
