@@ -113,7 +113,9 @@ def test_memory_is_what_system_and_container_spare(monkeypatch):
 
     monkeypatch.setattr(Path, "read_text", read_text)
     assert spare_memory() == 32 * 1024 / 2
-    assert spare_memory(4) == 32 * 1024 / 8
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    assert spare_memory() == 32 * 1024 / 8
+    monkeypatch.delenv("LOCAL_WORLD_SIZE")
     files |= {"/sys/fs/cgroup/memory.max": "20000\n", "/sys/fs/cgroup/memory.current": "4000\n"}
     assert spare_memory() == 8000
     files["/sys/fs/cgroup/memory.max"] = "max\n"

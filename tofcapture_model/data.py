@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -153,7 +154,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
     mean
         One item per view: the mean of its frames, for noise that is drawn again (:func:`tofcapture_model.augment.redraw_frame`).
     cache_bytes
-        Decoded frames and their ground truth are kept in memory up to this size: decoding anew takes as long as training on it.
+        Decoded frames and their ground truth are kept in memory up to this size; others are decoded again each time.
     cache
         Folder that ``tofcapture pack`` filled with this split of the one dataset; ``None`` reads the shards.
     """
@@ -278,8 +279,9 @@ def _size(reader: ShardReader | PackedScene) -> str:
     return " x ".join(map(str, (len(reader.info.modulation_hz), *reader.camera.shape)))
 
 
-def spare_memory(processes: int = 1) -> float:
-    """Bytes that decoded frames may take: half of what system and container have to spare, shared by ``processes``."""
+def spare_memory() -> float:
+    """Bytes that decoded frames may take: half of what system and container have to spare, shared by torchrun's processes here."""
+    processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     try:
         told = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
         spare = 1024.0 * int(told["MemAvailable"].split()[0])

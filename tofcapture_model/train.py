@@ -143,7 +143,7 @@ def train(
             seed=config.training.seed,
             frames=config.training.frames,
             mean=config.training.noise == "drawn",
-            cache_bytes=0 if workers else spare_memory(int(os.environ.get("LOCAL_WORLD_SIZE", "1"))),
+            cache_bytes=0 if workers else spare_memory(),
             cache=cache,
         )
         log = Log(out if rank == 0 else None)

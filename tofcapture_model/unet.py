@@ -121,8 +121,7 @@ def convex_upsample(image: Tensor, logits: Tensor) -> Tensor:
     b, c, h, w = image.shape
     weights = logits.float().reshape(b, 9, 4, h, w).softmax(dim=1)
     out = torch.zeros(b, c, 4, h, w, dtype=image.dtype, device=image.device)
-    for k, weight in enumerate(
-        weights.unbind(1)
-    ):  # indexing would fill a whole gradient for each of the nine
+    # indexing would fill a whole gradient for each of the nine
+    for k, weight in enumerate(weights.unbind(1)):
         out = out + shifted(image, k // 3 - 1, k % 3 - 1)[:, :, None] * weight[:, None]
     return F.pixel_shuffle(out.reshape(b, c * 4, h, w), 2)

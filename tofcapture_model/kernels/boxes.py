@@ -79,15 +79,13 @@ def wrap(leaves: Float32, n: int, offsets: Int64, margin: np.float32, boxes: Flo
 
 
 @compiled
-def _boxes_within(
-    boxes: Float32, g: int, x: np.float32, y: np.float32, z: np.float32, squared: np.float32
-) -> np.uint32:
-    """Bits of those of sixteen boxes that are nearer than a squared distance."""
+def _boxes_near(boxes: Float32, g: int, low: Point, high: Point, squared: np.float32) -> np.uint32:
+    """Bits of those of sixteen boxes that are nearer to the box from ``low`` to ``high`` than a squared distance."""
     bits = np.uint32(0)
     for k in range(FAN):
-        dx = max(boxes[g, 0, k] - x, x - boxes[g, 3, k], _ZERO)
-        dy = max(boxes[g, 1, k] - y, y - boxes[g, 4, k], _ZERO)
-        dz = max(boxes[g, 2, k] - z, z - boxes[g, 5, k], _ZERO)
+        dx = max(boxes[g, 0, k] - high[0], low[0] - boxes[g, 3, k], _ZERO)
+        dy = max(boxes[g, 1, k] - high[1], low[1] - boxes[g, 4, k], _ZERO)
+        dz = max(boxes[g, 2, k] - high[2], low[2] - boxes[g, 5, k], _ZERO)
         bits |= np.uint32(dx * dx + dy * dy + dz * dz < squared) << np.uint32(k)
     return bits
 
@@ -158,10 +156,10 @@ def _descend(
     p: Point, s: Point, best: np.float32, at: int,
 ) -> tuple[np.float32, int]:  # fmt: skip
     """Look at all leaves whose box is nearer than what is known; ``node`` and ``open_`` (levels,) are for its use."""
-    x, y, z = p[0] + s[0], p[1] + s[1], p[2] + s[2]
+    moved = p[0] + s[0], p[1] + s[1], p[2] + s[2]
     first, levels = at // FAN, len(offsets) - 1
     level = levels - 1
-    node[level], open_[level] = 0, _boxes_within(boxes, offsets[level], x, y, z, best)
+    node[level], open_[level] = 0, _boxes_near(boxes, offsets[level], moved, moved, best)
     while level < levels:
         bits = open_[level]
         if bits == 0:
@@ -171,22 +169,10 @@ def _descend(
         child = FAN * node[level] + _lowest(bits)
         if level > 0:
             level -= 1
-            node[level], open_[level] = child, _boxes_within(boxes, offsets[level] + child, x, y, z, best)
+            node[level], open_[level] = child, _boxes_near(boxes, offsets[level] + child, moved, moved, best)
         elif child != first:
             best, at = _look(leaves, child, p, s, best, at)
     return best, at
-
-
-@compiled
-def _boxes_near(boxes: Float32, g: int, low: Point, high: Point, squared: np.float32) -> np.uint32:
-    """Bits of those of sixteen boxes that are nearer to the box from ``low`` to ``high`` than a squared distance."""
-    bits = np.uint32(0)
-    for k in range(FAN):
-        dx = max(boxes[g, 0, k] - high[0], low[0] - boxes[g, 3, k], _ZERO)
-        dy = max(boxes[g, 1, k] - high[1], low[1] - boxes[g, 4, k], _ZERO)
-        dz = max(boxes[g, 2, k] - high[2], low[2] - boxes[g, 5, k], _ZERO)
-        bits |= np.uint32(dx * dx + dy * dy + dz * dz < squared) << np.uint32(k)
-    return bits
 
 
 @compiled
