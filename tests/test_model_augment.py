@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -13,8 +15,16 @@ from tofcapture.frames import PAPER_PHASE_RAD as PHASES
 from tofcapture.frames import TofInfo
 from tofcapture.ops.normals import normals_from_depth
 from tofcapture.ops.phase import Decoder, TapNoise, ambiguity, frequencies, phasors, radial_to_range, taps
-from tofcapture.rig import RangeError
-from tofcapture_model.augment import RawItem, crop, flip, redraw_frame, redraw_noise, scale_albedo
+from tofcapture.rig import SPEED_OF_LIGHT, RangeError
+from tofcapture_model.augment import (
+    RawItem,
+    crop,
+    flip,
+    redraw_calibration,
+    redraw_frame,
+    redraw_noise,
+    scale_albedo,
+)
 from tofcapture_model.data import batched, frame_decoder, make_frame
 
 CAMERA = Camera(24, 18, 20.0, 21.0, 11.2, 9.1)
@@ -138,6 +148,47 @@ def test_a_redrawn_frame_is_decoded_like_a_frame_of_the_burst():
         assert ((b.mean(0) - a.mean(0)).abs() / a.std(0)).max() < 0.4, field
     assert drawn[0].depth.dtype == torch.float32
     assert drawn[0].cues is mean.cues
+
+
+def test_another_calibration_is_what_the_decoder_would_have_made_of_it():
+    """The drawn error is an offset and two harmonics; a decoder that is told of them gives the same depth and gap."""
+    offsets, raw = {20e6: 0.01, 100e6: -0.2}, clean_taps()
+    info = TofInfo("", "", CAMERA, LIGHT, range_errors=tuple(RangeError(*e) for e in offsets.items()))
+    frame = batched(make_frame(raw, info, CAMERA))
+    moved = redraw_calibration(frame, torch.Generator().manual_seed(5), 0.001)
+    gap = (moved.gap - frame.gap)[0, 0].numpy()
+    depth = (moved.depth - frame.depth)[0, 0].numpy()
+    # fused: high + lean (low - high)
+    high = depth * np.linalg.norm(CAMERA.rays, axis=-1) - 20**2 / (20**2 + 100**2) * gap
+    told = []
+    for hz, by, z in zip(offsets, (high + gap, high), phasors(raw, HZ, PHASES), strict=True):
+        # the decoder's phase is turned by the offset
+        phase = np.angle(z) - 4 * np.pi * hz * offsets[hz] / SPEED_OF_LIGHT
+        waves = [f(m * phase).ravel() for m in (2, 4) for f in (np.cos, np.sin)]
+        constant, a, b, c, d = np.linalg.lstsq(np.stack([np.ones(by.size), *waves], 1), by.ravel())[0]
+        told.append(RangeError(hz, offsets[hz] - constant, harmonics=((2, -a, -b), (4, -c, -d))))
+    other = make_frame(raw, replace(info, range_errors=tuple(told)), CAMERA)
+    assert np.abs(depth).max() > 2.5e-4
+    np.testing.assert_allclose(moved.depth[0], other.depth, atol=4e-6)
+    np.testing.assert_allclose(moved.gap[0], other.gap, atol=3e-5)
+    assert moved.raw is frame.raw
+    assert moved.phasor is frame.phasor
+
+
+def test_calibrations_scatter_as_asked_and_each_frame_has_its_own():
+    """Range varies by sqrt(3) times the asked phase at every pixel; frames of a batch differ; holes keep their filling."""
+    info = TofInfo("", "", CAMERA, LIGHT, range_errors=ERRORS)
+    one = batched(make_frame(clean_taps(), info, CAMERA))
+    frame = type(one)(*(x.expand(600, *x.shape[1:]) for x in one))
+    frame = frame._replace(valid=frame.valid.clone())
+    frame.valid[..., :2, :] = 0
+    moved = redraw_calibration(frame, torch.Generator().manual_seed(6), 0.01)
+    metres = SPEED_OF_LIGHT / (4 * np.pi * 20e6)
+    low = moved.gap - frame.gap
+    assert low.std(0).median() == pytest.approx(0.01 * 3**0.5 * metres * (1 + 0.2**2) ** 0.5, rel=0.05)
+    assert (moved.depth - frame.depth)[..., :2, :].abs().max() == 0
+    torch.testing.assert_close((moved.cues - frame.cues)[:, -1:], low, atol=1e-6, rtol=0)
+    assert torch.equal(moved.cues[:, :-1], frame.cues[:, :-1])
 
 
 def test_a_darker_world_has_less_signal_the_same_ambient_and_the_noise_of_its_taps():

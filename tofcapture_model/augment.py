@@ -23,6 +23,11 @@ from tofcapture_model.frame import Frame
 from tofcapture_model.geometry import metres_per_radian, rays, turn
 
 FULL_SCALE = 4095.0  # raw units where a 12-bit sensor saturates
+_ORDERS = (
+    0,
+    2,
+    4,
+)  # of a phase error: four phases alias odd harmonics of the light to the second and the fourth
 
 
 class RawItem(NamedTuple):
@@ -213,10 +218,48 @@ def redraw_frame(
     low = turn(phasor[:, :2], frame.phasor[:, :2]) * metres_per_radian(frame, 0)
     high = turn(phasor[:, 2:], frame.phasor[:, 2:]) * metres_per_radian(frame, 1)
     confidence = phasor[:, 2:].square().sum(1, keepdim=True).sqrt()
+    return _moved(frame, low, high)._replace(raw=raw, phasor=phasor, confidence=confidence)
+
+
+def redraw_calibration(frame: Frame, generator: torch.Generator, radians: float) -> Frame:
+    """The same frame as if another camera of the make had taken it, whose calibration is wrong in another way.
+
+    Of each frequency's systematic error a part is never known: ``sum_m (a_m cos m phi + b_m sin m phi)`` metres over the measured
+    phase phi, with m = 0, 2, 4, as :class:`tofcapture.rig.RangeError` writes it. ``a_m`` and ``b_m`` are drawn anew for each frame of the batch, so
+    that no network can learn the errors of a few cameras by heart and take its depth for surer than it is.
+
+    Parameters
+    ----------
+    frame
+        (B, ., H, W).
+    generator
+        Of the frame's device.
+    radians
+        Standard deviation of each amplitude, as phase; a camera's error varies by ``sqrt(3)`` times this.
+
+    Returns
+    -------
+    A frame of which depth, gap and the cue of the gap have moved; raw, phasors and confidence are what was measured.
+    """
+    low, high = (_drawn_error(frame, which, generator) * radians for which in (0, 1))
+    moved = _moved(frame, low, high)
+    cues = torch.cat([frame.cues[:, :-1], frame.cues[:, -1:] + low - high], dim=1)
+    return moved._replace(cues=cues)
+
+
+def _drawn_error(frame: Frame, which: int, generator: torch.Generator) -> Tensor:
+    """(B, 1, H, W) metres per radian of amplitude, for the low (0) or the high (1) frequency."""
+    in_phase, quadrature = frame.phasor[:, 2 * which : 2 * which + 2].chunk(2, dim=1)
+    phase = torch.atan2(quadrature, in_phase)
+    waves = torch.cat([wave(m * phase) for m in _ORDERS for wave in (torch.cos, torch.sin)], dim=1)
+    amplitudes = torch.randn((*waves.shape[:2], 1, 1), generator=generator, device=waves.device)
+    return (amplitudes * waves).sum(1, keepdim=True) * metres_per_radian(frame, which)
+
+
+def _moved(frame: Frame, low: Tensor, high: Tensor) -> Frame:
+    """Add (B, 1, H, W) metres to the range of each frequency: depth moves as the decoder fuses them, holes do not."""
     square = frame.modulation.square()
-    lean = (square[:, :1] / square.sum(1, keepdim=True)).reshape(-1, 1, 1, 1)  # as the decoder fuses
+    lean = (square[:, :1] / square.sum(1, keepdim=True)).reshape(-1, 1, 1, 1)
     length = rays(frame.intrinsics, *frame.depth.shape[-2:]).square().sum(1, keepdim=True).sqrt()
     depth = frame.depth + frame.valid * (high + lean * (low - high)) / length
-    return frame._replace(
-        raw=raw, phasor=phasor, depth=depth, gap=frame.gap + low - high, confidence=confidence
-    )
+    return frame._replace(depth=depth, gap=frame.gap + low - high)

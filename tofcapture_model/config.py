@@ -168,6 +168,9 @@ class Training:
     noise
         ``recorded``: frames as they were taken; ``drawn``: the mean of each view's frames with fresh shot and read noise, drawn on
         the training device, so that no frame is ever seen twice.
+    phase_error
+        Radians; above 0 every crop is given an error of calibration of its own, offset and wiggling of each frequency, as another
+        camera of the make would have (:func:`tofcapture_model.augment.redraw_calibration`).
     flip
         Mirror frames at random: right as far as the light source stands near the lens.
     schedule
@@ -186,6 +189,7 @@ class Training:
     crop: tuple[int, ...] = ()
     frames: int = 0
     noise: str = "recorded"
+    phase_error: float = 0.0
     flip: bool = False
     schedule: str = "constant"
     validate_every: int = 0
@@ -203,6 +207,7 @@ class Training:
         )
         _require(self.noise in ("recorded", "drawn"), "training.noise", "recorded or drawn", self.noise)
         _require(self.frames >= 0, "training.frames", ">= 0", self.frames)
+        _require(0 <= self.phase_error < 0.5, "training.phase_error", "radians, 0 to 0.5", self.phase_error)
         _require(
             len(self.crop) in (0, 2) and all(c >= 32 for c in self.crop),
             "training.crop",

@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.seal import sha256_of
-from tofcapture_model.augment import redraw_frame
+from tofcapture_model.augment import redraw_calibration, redraw_frame
 from tofcapture_model.checkpoint import (
     find_model,
     load_model,
@@ -171,8 +171,11 @@ def train(
                     progress = _progress(position, stage, len(batches), budget)
                     rate = _learning_rate(optimizer, stage, config.training.schedule, progress)
                     frame, target = frame_to(frame, place), target_to(target, place)  # noqa: PLW2901
+                    drawn = _noise(position, config, place)
                     if data.mean:
-                        frame = redraw_frame(frame, _noise(position, config, place), averaged=data.averaged)  # noqa: PLW2901
+                        frame = redraw_frame(frame, drawn, averaged=data.averaged)  # noqa: PLW2901
+                    if config.training.phase_error:
+                        frame = redraw_calibration(frame, drawn, config.training.phase_error)  # noqa: PLW2901
                     with half:
                         estimate = called(frame, stage.name)
                     estimate = Estimate(*(x.float() for x in estimate))
