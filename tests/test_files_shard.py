@@ -17,6 +17,7 @@ import pytest
 
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError, FormatError
+from tofcapture.files.hdf import open_checked
 from tofcapture.files.layout import MASK_DOCS, SHARD, VIEW, MaskBit
 from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, object_of, write_manifest
 from tofcapture.files.page import formats_markdown
@@ -150,6 +151,16 @@ def _raw_sum(reader, queue=None):
     if queue is not None:
         queue.put(total)
     return total
+
+
+def test_open_files_hold_no_chunks(tmp_path):
+    """A chunk is a frame, read whole: a cache of chunks would hold megabytes of every open shard for nothing."""
+    path = tmp_path / "scene.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs.update(format=SHARD.format, version=SHARD.version)
+        file.create_dataset("a", data=np.zeros((2, 64, 64)), chunks=(1, 64, 64))
+    with open_checked(path, SHARD) as file:
+        assert file["a"].id.get_access_plist().get_chunk_cache()[1] == 0
 
 
 def test_the_reader_pickles_and_survives_a_fork(tmp_path):

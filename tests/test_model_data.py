@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import json
+import math
+import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,8 +19,17 @@ from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.seal import sha256_of
 from tofcapture_model import data as module
 from tofcapture_model.checkpoint import load_model
-from tofcapture_model.data import FrameDataset, SampleId, collate, epoch_batches, mirror, spare_memory
+from tofcapture_model.data import (
+    FrameDataset,
+    SampleId,
+    collate,
+    epoch_batches,
+    frame_decoder,
+    mirror,
+    spare_memory,
+)
 from tofcapture_model.geometry import depth_to_normals, scale_intrinsics
+from tofcapture_model.raw_input import NOMINAL_CAMERA
 
 
 @pytest.fixture(scope="module")
@@ -94,12 +106,26 @@ def test_whole_frames_and_crops_collate(dataset):
 def test_frames_stay_in_memory_as_far_as_it_goes(dataset):
     """What is kept is the very same object and takes no more than it may; what is not kept is the same bits."""
     first = SampleId("scene-0", 0, 0)
-    size = sum(x.nbytes for x in FrameDataset(dataset, "train").frame(first))
-    data = FrameDataset(dataset, "train", cache_bytes=2.5 * size)
+    plain = FrameDataset(dataset, "train")
+    size = sum(x.nbytes for x in plain.frame(first))
+    tables = sum(module.TABLES * math.prod(r.camera.shape) for r in plain.readers.values())
+    data = FrameDataset(dataset, "train", cache_bytes=tables + 2.5 * size)
     kept = [data.frame(s) for s in data.samples]
     again = [data.frame(s) for s in data.samples]
     assert [a is b for a, b in zip(kept, again, strict=True)] == [True, True] + [False] * (len(kept) - 2)
     assert all(torch.equal(x, y) for a, b in zip(kept, again, strict=True) for x, y in zip(a, b, strict=True))
+
+
+def test_decoders_take_what_is_set_aside_for_them(dataset):
+    """Arrays of a decoder and its camera, measured: what training takes off the memory for frames."""
+    reader = next(iter(FrameDataset(dataset, "train").readers.values()))
+    camera = NOMINAL_CAMERA
+    tracemalloc.start()
+    decoder = frame_decoder(replace(reader.info, camera=camera), camera)
+    taken = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert decoder.info.camera == camera
+    assert 0.7 * module.TABLES < taken / math.prod(camera.shape) < 1.1 * module.TABLES
 
 
 def test_memory_is_what_system_and_container_spare(monkeypatch):

@@ -220,3 +220,22 @@ def test_what_is_bundled_loads_and_answers(tmp_path):
     assert (error > 0).all()
     assert find_model(None) == bundled_path()
     assert (find_model(None).parent / "MODEL_CARD.md").is_file()
+
+
+@pytest.mark.skipif(bundled_path() is None, reason="no weights are bundled in this tree")
+def test_half_the_mantissa_changes_less_than_noise_does(tmp_path, monkeypatch):
+    """Trained in bfloat16 it answers in bfloat16 where the processor has it: tenths of its own sigma, never NaN, float32 out."""
+    data = read_input(saved(tmp_path / "raw.npy", table_top(NOMINAL_CAMERA)[0]))
+    monkeypatch.setattr(predicting, "WARM", 0)
+    monkeypatch.setattr(predicting, "RUNS", 1)
+    answers = []
+    for able in (False, True):
+        monkeypatch.setattr(predicting, "_has_bfloat16", lambda _kind, able=able: able)
+        answers.append(predict_raw(data, 0, None))
+    single, half = answers
+    assert half.depth.dtype == half.normals.dtype == half.error.dtype == np.float32
+    moved = np.abs(half.depth - single.depth)
+    assert 0 < moved.mean() < 0.1 * single.error.mean()
+    turned = np.degrees(np.arccos(np.clip((half.normals * single.normals).sum(-1), -1, 1)))
+    assert turned.mean() < 0.5
+    np.testing.assert_allclose(np.median(half.error / single.error), 1, atol=0.02)

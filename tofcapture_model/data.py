@@ -29,6 +29,7 @@ from tofcapture_model.shards import SampleId, all_samples, open_scenes
 
 Float32 = NDArray[np.float32]
 MODEST = 1.5e9  # bytes, where the system does not tell what it has
+TABLES = 110  # bytes per pixel of a decoder and its camera's rays, one for each scene
 MAX_RANGE = 5.0  # m; a decoded depth beyond it is an unwrapping failure on this rig and counts as a hole
 
 
@@ -192,7 +193,9 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
                 hint="record more scenes, or choose another --split",
             )
         _expect_alike(self.readers, self.size)
-        self._room = cache_bytes
+        self._room = cache_bytes - sum(
+            TABLES * r.camera.width * r.camera.height for r in self.readers.values()
+        )
         self._frames: dict[SampleId, Frame] = {}
         self._targets: dict[tuple[str, int], Target] = {}
         self._decoders: dict[str, Decoder] = {}

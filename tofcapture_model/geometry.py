@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -55,17 +56,41 @@ def shifted(image: Tensor, dy: int, dx: int) -> Tensor:
     return padded[..., max(dy, 0) : max(dy, 0) + h, max(dx, 0) : max(dx, 0) + w]
 
 
+def doubled_parts(image: Tensor) -> Tensor:
+    """Bilinear x2 (B, C, 4, H, W), the four sub-pixels beside each other: what ``pixel_shuffle`` of (B, 4C, H, W) interleaves."""
+    across = [0.75 * image + 0.25 * shifted(image, 0, dx) for dx in (-1, 1)]
+    return torch.stack([0.75 * a + 0.25 * shifted(a, dy, 0) for dy in (-1, 1) for a in across], dim=2)
+
+
 def offsets(radius: int, step: int = 1) -> Iterator[tuple[int, int]]:
     """Yield the (dy, dx) of a square window without its centre."""
     reach = range(-radius * step, radius * step + 1, step)
     return ((dy, dx) for dy in reach for dx in reach if (dy, dx) != (0, 0))
 
 
-def _moment_filters(radius: int) -> Tensor:
-    """(6, 1, k, k) weights 1, u, v, uu, uv, vv of a window."""
+@cache
+def _moment_filters(radius: int) -> tuple[Tensor, Tensor]:
+    """(6, 3, 1, k) along rows and (10, 6, k, 1) along columns: which power of u, then of v, of which image."""
     r = torch.arange(-radius, radius + 1, dtype=torch.float64)
-    v, u = torch.meshgrid(r, r, indexing="ij")
-    return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v])[:, None]
+    powers = [torch.ones_like(r), r, r * r]
+    rows, columns = (torch.zeros(o, i, len(r), dtype=torch.float64) for o, i in ((6, 3), (10, 6)))
+    for out, (image, power) in enumerate(((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0))):
+        rows[out, image] = powers[power]
+    for out, (row, power) in enumerate(
+        ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (4, 0), (3, 1), (5, 0))
+    ):
+        columns[out, row] = powers[power]
+    return rows[:, :, None], columns[..., None]
+
+
+def _moments(images: Tensor, radius: int) -> Tensor:
+    """(B, 10, H, W) sums over every window of images (B, 3, H, W) a, b, c: ``a (1, u, v, uu, uv, vv), b (1, u, v), c``.
+
+    All at once: convolutions of one channel run at a fraction of a processor's speed.
+    """
+    rows, columns = (f.to(images) for f in _moment_filters(radius))
+    with torch.autocast(images.device.type, enabled=False):  # eight bits of mantissa hold no moments
+        return F.conv2d(F.conv2d(images, rows, padding=(0, radius)), columns, padding=(radius, 0))
 
 
 def local_planes(depth: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Tensor]:
@@ -90,11 +115,8 @@ def local_planes(depth: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Ten
     inverse = 1 / depth
     origin = inverse.mean(dim=(2, 3), keepdim=True)  # float32 moments cancel badly far from zero
     i = (inverse - origin) * valid
-    bank = _moment_filters(radius).to(depth)
-    with torch.autocast(depth.device.type, enabled=False):  # eight bits of mantissa hold no moments
-        s1, su, sv, suu, suv, svv = F.conv2d(valid, bank, padding=radius).unbind(1)
-        t1, tu, tv = F.conv2d(i, bank[:3], padding=radius).unbind(1)
-        tt = F.conv2d(i * (inverse - origin), bank[:1], padding=radius)[:, 0]
+    images = torch.cat([valid, i, i * (inverse - origin)], dim=1)
+    s1, su, sv, suu, suv, svv, t1, tu, tv, tt = _moments(images, radius).unbind(1)
     # a window with one row or column of pixels has a slope of zero across it
     ridge = 10 * torch.finfo(depth.dtype).eps * suu + _TINY
     n = s1.clamp_min(_TINY)

@@ -14,7 +14,14 @@ from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.config import SOURCES, Network
 from tofcapture_model.frame import Frame, expect_channels
-from tofcapture_model.geometry import local_planes, plane_normals, rays, side_window_planes, unit
+from tofcapture_model.geometry import (
+    doubled_parts,
+    local_planes,
+    plane_normals,
+    rays,
+    side_window_planes,
+    unit,
+)
 from tofcapture_model.unet import (
     CONVEX_CHANNELS,
     UNet,
@@ -198,15 +205,17 @@ class Raw2Normal(nn.Module):
 
     def forward(self, shared: Tensor, features: Features, depth: Tensor, frame: Frame) -> Tensor:
         """Return unit camera-facing normals (B, 3, 2H, 2W) of a depth (B, 1, 2H, 2W)."""
-        start = doubled(features.normals)
         if not self.fits:
-            return unit(start + F.pixel_shuffle(self.net(shared).float(), 2))
+            return unit(doubled(features.normals) + F.pixel_shuffle(self.net(shared).float(), 2))
         fitted = self._fitted(depth, frame)
         out = self.net(torch.cat([shared, features.normals, *fitted], dim=1)).float()
-        fine = F.pixel_shuffle(out, 2)
-        residual, gates = fine[:, :3], fine[:, 3:].chunk(len(fitted), dim=1)
-        steps = [g * (doubled(n) - start) for g, n in zip(gates, fitted, strict=True)]
-        return unit(torch.stack([start + residual, *steps]).sum(0))
+        # sub-pixels side by side until the end: interpolating and interleaving each term costs more than the convolutions
+        parts = out.unflatten(1, (-1, 4))
+        start = doubled_parts(features.normals)
+        normals = start + parts[:, :3]
+        for k, n in enumerate(fitted, 3):
+            normals = normals + parts[:, k : k + 1] * (doubled_parts(n) - start)
+        return F.pixel_shuffle(unit(normals).flatten(1, 2), 2)
 
     def _fitted(self, depth: Tensor, frame: Frame) -> list[Tensor]:
         coarse = F.avg_pool2d(depth, 2)

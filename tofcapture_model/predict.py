@@ -112,13 +112,28 @@ Ask = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
 
 
 def _torch_model(weights: Path | None, device: str) -> Ask:
-    model = load_model(weights)[0].to(device)
+    """Compute as it was trained: in bfloat16 if that is how it learned, and where the processor has it."""
+    model, config, _ = load_model(weights)
+    model = model.to(device)
+    kind = torch.device(device).type
+    half = config.training.precision == "bfloat16" and _has_bfloat16(kind)
 
     def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        found = model(frame)
+        with torch.autocast(kind, torch.bfloat16, enabled=half):
+            found = model(frame)
         return found.depth, found.normals, found.error
 
     return ask
+
+
+def _has_bfloat16(kind: str) -> bool:
+    """Whether a device multiplies in bfloat16 by itself; emulated it would be slower than float32."""
+    if kind == "cuda":
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+    able = torch.cpu.get_capabilities()
+    return kind == "cpu" and any(
+        bool(able.get(name)) for name in ("avx512_bf16", "amx_bf16", "arm_bf16", "bf16")
+    )
 
 
 def _onnx_model(weights: Path | None, camera: Camera) -> Ask:

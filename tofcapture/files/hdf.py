@@ -88,7 +88,8 @@ def open_checked(path: Path, layout: Layout, *earlier: Layout) -> h5py.File:
         HDF5 of another format or version.
     """
     try:
-        file = h5py.File(path, "r")
+        # chunks are single frames, read whole: HDF5 2 would keep 8 MB of each field of each open file for nothing
+        file = h5py.File(path, "r", rdcc_nbytes=0)
     except FileNotFoundError as err:
         raise DataError(f"{path}: expected a {layout.format} file, found nothing there") from err
     except (OSError, RuntimeError, ValueError) as err:
