@@ -20,7 +20,10 @@ from tofcapture_model.checkpoint import find_model, load_model, save_model
 from tofcapture_model.config import preset
 from tofcapture_model.data import batched, make_frame
 from tofcapture_model.export import export
+from tofcapture_model.frame import Estimate, Frame
+from tofcapture_model.joint import JointModel
 from tofcapture_model.onnx_backend import ask_onnx, open_onnx
+from tofcapture_model.predict import has_bfloat16
 from tofcapture_model.raw_input import NOMINAL_CAMERA
 from tofcapture_model.zoo import build_model
 
@@ -34,6 +37,12 @@ def raw_frame() -> np.ndarray:
         [4 * np.pi * f * distance / 299792458.0 + k * np.pi / 2 for f in (20e6, 100e6) for k in range(4)]
     )
     return np.rint(600 + 300 * np.cos(phase) + rng.normal(0, 5, phase.shape)).astype(np.uint16)
+
+
+def in_half(model: JointModel, frame: Frame) -> Estimate:
+    """Answer as `predict` does with a network that was trained in bfloat16."""
+    with torch.autocast("cpu", torch.bfloat16):
+        return model(frame)
 
 
 def main() -> None:
@@ -57,6 +66,8 @@ def main() -> None:
             "decode and cues": lambda: make_frame(raw, info, NOMINAL_CAMERA),
             "network, torch": lambda: model(frame),
         }
+        if has_bfloat16("cpu"):
+            calls["network, torch, bfloat16"] = lambda: in_half(model, frame)
         try:
             out = Path(folder) / "model.onnx"
             export(find_model(weights), out)

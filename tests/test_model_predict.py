@@ -230,7 +230,7 @@ def test_half_the_mantissa_changes_less_than_noise_does(tmp_path, monkeypatch):
     monkeypatch.setattr(predicting, "RUNS", 1)
     answers = []
     for able in (False, True):
-        monkeypatch.setattr(predicting, "_has_bfloat16", lambda _kind, able=able: able)
+        monkeypatch.setattr(predicting, "has_bfloat16", lambda _kind, able=able: able)
         answers.append(predict_raw(data, 0, None))
     single, half = answers
     assert half.depth.dtype == half.normals.dtype == half.error.dtype == np.float32

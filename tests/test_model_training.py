@@ -20,6 +20,7 @@ from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.cache import pack
 from tofcapture.files.seal import sha256_of
+from tofcapture_model import progress as progressing
 from tofcapture_model.checkpoint import load_model, load_resume
 from tofcapture_model.config import Network, Stage, preset
 from tofcapture_model.data import FrameDataset, batched
@@ -310,3 +311,16 @@ def test_two_processes_train_together(dataset, tmp_path):
     assert [r.returncode for r in ranks] == [0, 0]
     assert {s.split()[-1] for s in said} == {"3"}
     assert (tmp_path / "run" / "model.safetensors").exists()
+
+
+def test_a_run_that_goes_on_knows_how_long_the_rest_takes(monkeypatch, capsys):
+    """Without a terminal: from 60 % on, 10 % in a minute leave three; what was done before the start took other time."""
+    clock = iter([1000.0, 1060.0])
+    monkeypatch.setattr(progressing.time, "monotonic", lambda: next(clock))
+    with progressing.progress() as report:
+        report("joint", 0.6)
+        report("joint", 0.7, "step 70")
+    assert capsys.readouterr().err.splitlines() == [
+        "joint: 60 %, time left unknown",
+        "joint: 70 %, 3 min left step 70",
+    ]

@@ -116,7 +116,7 @@ def _torch_model(weights: Path | None, device: str) -> Ask:
     model, config, _ = load_model(weights)
     model = model.to(device)
     kind = torch.device(device).type
-    half = config.training.precision == "bfloat16" and _has_bfloat16(kind)
+    half = config.training.precision == "bfloat16" and has_bfloat16(kind)
 
     def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         with torch.autocast(kind, torch.bfloat16, enabled=half):
@@ -126,7 +126,7 @@ def _torch_model(weights: Path | None, device: str) -> Ask:
     return ask
 
 
-def _has_bfloat16(kind: str) -> bool:
+def has_bfloat16(kind: str) -> bool:
     """Whether a device multiplies in bfloat16 by itself; emulated it would be slower than float32."""
     if kind == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))

@@ -18,22 +18,24 @@ class Report(Protocol):
         """Show that ``what`` is done to this fraction."""
 
 
-def remaining(seconds: float, fraction: float) -> str:
-    """Estimate the time left, from the time spent and the fraction done."""
-    if fraction <= 0:
+def remaining(seconds: float, done: float, fraction: float) -> str:
+    """Estimate the time left, from the time spent on a part ``done`` of the whole and the fraction that is done by now."""
+    if done <= 0:
         return "time left unknown"
-    left = seconds * (1 - fraction) / fraction
+    left = seconds * (1 - fraction) / done
     return f"{left / 60:.0f} min left" if left > 90 else f"{left:.0f} s left"
 
 
 def _plain() -> Report:
-    started, last = time.monotonic(), [0.0]
+    first: dict[str, tuple[float, float]] = {}  # a run that goes on does not start at zero
+    last = [0.0]
 
     def report(what: str, fraction: float, text: str = "", /) -> None:
         now = time.monotonic()
+        started, before = first.setdefault(what, (now, fraction))
         if now - last[0] >= PLAIN_EVERY or fraction >= 1:
             last[0] = now
-            left = remaining(now - started, fraction)
+            left = remaining(now - started, fraction - before, fraction)
             print(f"{what}: {100 * fraction:.0f} %, {left} {text}".rstrip(), file=sys.stderr)
 
     return report
