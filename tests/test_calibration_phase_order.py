@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from calibration import calibrate_cli
@@ -52,12 +52,17 @@ def made(seed, hz_of, *, bipolar=False, noise=2.0, offset=0.1):
 
 
 def same(order, hz, theta):
-    turned = np.abs(np.angle(np.exp(1j * (np.array(order.phase_rad) - theta))))
-    return order.modulation_hz == tuple(hz) and turned.max() < 1e-9
+    """Whether this is the order; where the start is only assumed, up to one turn for all taps of a frequency."""
+    turned = np.exp(1j * (np.array(order.phase_rad) - theta))
+    if not order.start_known:
+        firsts = {f: turned[list(hz).index(f)] for f in hz}
+        turned = turned / np.array([firsts[f] for f in hz])
+    return order.modulation_hz == tuple(hz) and np.abs(np.angle(turned)).max() < 1e-9
 
 
 @pytest.mark.parametrize("hz_of", [(30e6,), (20e6, 100e6)])
 @given(seed=seeds, bipolar=st.booleans(), reference=st.booleans())
+@example(seed=4954, bipolar=False, reference=False)  # brightness does not tell this start, and says so
 @few
 def test_order_is_found(hz_of, seed, bipolar, reference):
     """Any order, sign and start of unipolar or bipolar taps is found, with a reference depth and without."""
@@ -67,6 +72,7 @@ def test_order_is_found(hz_of, seed, bipolar, reference):
     assert 0 < order.confidence <= 1
     assert order.second_harmonic < 0.02
     if reference:
+        assert order.start_known
         np.testing.assert_allclose(order.offset_rad, 0.1, atol=0.02)
 
 
