@@ -23,11 +23,7 @@ from tofcapture_model.frame import Frame
 from tofcapture_model.geometry import metres_per_radian, rays, turn
 
 FULL_SCALE = 4095.0  # raw units where a 12-bit sensor saturates
-_ORDERS = (
-    0,
-    2,
-    4,
-)  # of a phase error: four phases alias odd harmonics of the light to the second and the fourth
+_ORDERS = (0, 2, 4)  # of the phase: offset, and the wiggling of sensors with four phases
 
 
 class RawItem(NamedTuple):
@@ -224,7 +220,7 @@ def redraw_frame(
 def redraw_calibration(frame: Frame, generator: torch.Generator, radians: float) -> Frame:
     """The same frame as if another camera of the make had taken it, whose calibration is wrong in another way.
 
-    Of each frequency's systematic error a part is never known: ``sum_m (a_m cos m phi + b_m sin m phi)`` metres over the measured
+    Of each frequency's systematic error a part is never known: ``sum_m (a_m cos m phi + b_m sin m phi)`` over the measured
     phase phi, with m = 0, 2, 4, as :class:`tofcapture.rig.RangeError` writes it. ``a_m`` and ``b_m`` are drawn anew for each frame of the batch, so
     that no network can learn the errors of a few cameras by heart and take its depth for surer than it is.
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import cache
 
 import torch
 from torch import Tensor
@@ -68,7 +67,6 @@ def offsets(radius: int, step: int = 1) -> Iterator[tuple[int, int]]:
     return ((dy, dx) for dy in reach for dx in reach if (dy, dx) != (0, 0))
 
 
-@cache
 def _moment_filters(radius: int) -> tuple[Tensor, Tensor]:
     """(6, 3, 1, k) along rows and (10, 6, k, 1) along columns: which power of u, then of v, of which image."""
     r = torch.arange(-radius, radius + 1, dtype=torch.float64)
