@@ -1,19 +1,19 @@
 """Robust Chamfer loss on the image grid (paper eq. 2 with the seven jitter candidates), exact.
 
-The neighbours come from :mod:`tofcapture_model.trees` on a CPU with numba, else from :mod:`tofcapture_model.neighbours`. They carry no
-gradient; the pairs that they make do.
+The neighbours come from :mod:`tofcapture_model.trees` on a CPU with numba, from :mod:`tofcapture_model.tile_search` on a GPU with Triton,
+else from :mod:`tofcapture_model.neighbours`. They carry no gradient; the pairs that they make do.
 """
 
 from __future__ import annotations
 
 import math
-from types import EllipsisType
+from types import EllipsisType, ModuleType
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from tofcapture_model import neighbours, trees
+from tofcapture_model import neighbours, tile_search, trees
 from tofcapture_model.neighbours import Found
 
 JITTER = 0.010  # m, paper: 1 centimetre
@@ -119,15 +119,15 @@ def _item(
         return _directed(p, q, p_mask, q_mask, found.index, shift[:, None], normals)
 
     clouds = (p.detach(), q.detach(), p_mask, q_mask)
-    compiled = trees.usable(p.device)
+    compiled = _compiled(p.device)
     if softness == 0 and normals is None:
         k, found, scores = (
-            trees.nearest_of_best(*clouds, shifts)
+            compiled.nearest_of_best(*clouds, shifts)
             if compiled
             else neighbours.nearest_of_best(*clouds, intrinsics, shifts)
         )
         return directed(found, shifts[k]), scores, torch.tensor(k, device=p.device)
-    every = trees.nearest(*clouds, shifts) if compiled else neighbours.nearest(*clouds, intrinsics, shifts)
+    every = compiled.nearest(*clouds, shifts) if compiled else neighbours.nearest(*clouds, intrinsics, shifts)
     losses = torch.stack([directed(f, s) for f, s in zip(every, shifts, strict=True)])
     winner = losses.argmin()
     soft = (
@@ -136,6 +136,11 @@ def _item(
         else losses[winner]
     )
     return soft, losses.detach(), winner
+
+
+def _compiled(device: torch.device) -> ModuleType | None:
+    """Return the compiled search that runs there, if one does."""
+    return next((search for search in (trees, tile_search) if search.usable(device)), None)
 
 
 def _box(mask: Tensor) -> tuple[tuple[EllipsisType, slice, slice], Tensor]:

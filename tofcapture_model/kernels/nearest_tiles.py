@@ -1,0 +1,121 @@
+"""Nearest points by tiles of a grid, in Triton: the search of the robust Chamfer loss on a GPU, all shifts and both ways in one launch.
+
+A program, one warp of a GPU, answers for the 64 queries of one tile. It looks at the other cloud's tile in the same place, then at
+every other tile whose bounding box is nearer than the worst answer so far, nearest box first, unless for each single query the
+box is farther away than its own answer. What is left out cannot hold a nearer point: nothing is approximated.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+POINTS = 64  # of a tile
+PART = 8  # points that all queries are compared with at once: registers hold the distances
+BLOCK = 256  # boxes that are looked at together
+
+
+@triton.jit
+def search(
+    points, boxes, shifts, squared, codes, tiles,
+    WITH_CODES: tl.constexpr, POINTS: tl.constexpr, PART: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Find the nearest of P + s in Q (way 0) and of Q - s in P (way 1); grid (T, 2 S), whose second axis counts ``2 shift + way``.
+
+    Parameters
+    ----------
+    points
+        (2, T, 3, 64) float32, both clouds by tiles, metres; what is masked is at infinity.
+    boxes
+        (2, 6, T) float32, least and greatest coordinates of every tile's points; of none inf and -inf.
+    shifts
+        (S, 3) float32, metres.
+    squared
+        (S, 2, T, 64) float32, written: m^2, -1 where masked.
+    codes
+        (S, 2, T, 64) int32, written if ``WITH_CODES``: 64 times the tile of the nearest, plus its place there.
+    tiles
+        T.
+    WITH_CODES
+        Whether to say who the nearest are.
+    POINTS, PART, BLOCK
+        The module's; Triton takes constants as arguments.
+    """
+    tile, job = tl.program_id(0), tl.program_id(1)
+    way = job % 2
+    other = 1 - way
+    sign = 1.0 - 2.0 * way
+    lane = tl.arange(0, POINTS)
+    own = points + (way * tiles + tile) * 3 * POINTS + lane
+    x, y, z = tl.load(own), tl.load(own + POINTS), tl.load(own + 2 * POINTS)
+    there = x < float("inf")
+    shift = shifts + 3 * (job // 2)
+    x = tl.where(there, x + sign * tl.load(shift), 0.0)
+    y = tl.where(there, y + sign * tl.load(shift + 1), 0.0)
+    z = tl.where(there, z + sign * tl.load(shift + 2), 0.0)
+    least_x, most_x = _extent(x, there)
+    least_y, most_y = _extent(y, there)
+    least_z, most_z = _extent(z, there)
+
+    theirs = points + other * tiles * 3 * POINTS
+    corners = boxes + other * 6 * tiles
+    best = tl.where(there, float("inf"), -1.0)
+    found = tl.zeros((POINTS,), tl.int32)
+    best, found = _look(theirs, tile, x, y, z, best, found, WITH_CODES, POINTS, PART)
+    worst = tl.max(best, 0)
+    for start in range(0, tiles, BLOCK):
+        number = start + tl.arange(0, BLOCK)
+        bound = _apart(corners, number, tiles, least_x, most_x, least_y, most_y, least_z, most_z)
+        bound = tl.where(number == tile, float("inf"), bound)
+        nearest = tl.min(bound, 0)
+        while nearest < worst:
+            one = start + tl.argmin(bound, 0)
+            needed = _apart(corners, one + 0 * lane, tiles, x, x, y, y, z, z) < best
+            if tl.max(needed.to(tl.int32), 0) > 0:
+                best, found = _look(theirs, one, x, y, z, best, found, WITH_CODES, POINTS, PART)
+                worst = tl.max(best, 0)
+            bound = tl.where(number == one, float("inf"), bound)
+            nearest = tl.min(bound, 0)
+
+    out = (job * tiles + tile) * POINTS + lane
+    tl.store(squared + out, best)
+    if WITH_CODES:
+        tl.store(codes + out, found)
+
+
+@triton.jit
+def _extent(values, there):
+    """Least and greatest of the values that are there; inf and -inf of none."""
+    least = tl.min(tl.where(there, values, float("inf")), 0)
+    return least, tl.max(tl.where(there, values, -float("inf")), 0)
+
+
+@triton.jit
+def _apart(corners, number, tiles, x0, x1, y0, y1, z0, z1):
+    """Squared distance, from below, of tiles' boxes to the box from (x0, y0, z0) to (x1, y1, z1); inf beyond the last tile."""
+    inside, at, none = number < tiles, corners + number, float("inf")
+    x = tl.maximum(tl.load(at, inside, none) - x1, x0 - tl.load(at + 3 * tiles, inside, -none))
+    y = tl.maximum(tl.load(at + tiles, inside, none) - y1, y0 - tl.load(at + 4 * tiles, inside, -none))
+    z = tl.maximum(tl.load(at + 2 * tiles, inside, none) - z1, z0 - tl.load(at + 5 * tiles, inside, -none))
+    x, y, z = tl.maximum(x, 0.0), tl.maximum(y, 0.0), tl.maximum(z, 0.0)
+    return (x * x + y * y + z * z) * (1 - 1e-6)  # this sum and that of a distance may round apart
+
+
+@triton.jit
+def _look(
+    theirs, tile, x, y, z, best, found, WITH_CODES: tl.constexpr, POINTS: tl.constexpr, PART: tl.constexpr
+):
+    """Compare all queries with all points of a tile; a lane keeps its queries, so that lanes need not agree."""
+    for start in tl.static_range(0, POINTS, PART):
+        at = theirs + tile * 3 * POINTS + start + tl.arange(0, PART)
+        dx = tl.load(at)[:, None] - x[None, :]
+        dy = tl.load(at + POINTS)[:, None] - y[None, :]
+        dz = tl.load(at + 2 * POINTS)[:, None] - z[None, :]
+        squares = dx * dx + dy * dy + dz * dz
+        if WITH_CODES:
+            least, which = tl.min(squares, 0, return_indices=True, return_indices_tie_break_left=False)
+            found = tl.where(least < best, tile * POINTS + start + which, found)
+        else:
+            least = tl.min(squares, 0)
+        best = tl.minimum(best, least)
+    return best, found
