@@ -1,8 +1,10 @@
-"""Latency of one frame: decode and network, by backend, on two threads.
+"""Latency of one frame: decode and network, by backend, on two threads or a GPU; throughput of batches.
 
-    python benchmarks/predict.py [--preset compact] [--weights RUN] [--repeats 20]
+    python benchmarks/predict.py [--preset compact] [--weights RUN] [--repeats 20] [--batch 8] [--device cuda]
 
-240 x 180 raw to 480 x 360 depth, normals and uncertainty, after loading. Wall and CPU time, medians, backends in turns.
+240 x 180 raw to 480 x 360 depth, normals and uncertainty, after loading. Wall and CPU time, medians, backends in turns. Throughput
+comes with its share of peak: operations of convolutions and matrix products per second, over those of one large matrix product in
+the same precision, run beside it.
 """
 
 from __future__ import annotations
@@ -14,17 +16,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from tofcapture.frames import TofInfo
 from tofcapture_model.checkpoint import find_model, load_model, save_model
 from tofcapture_model.config import preset
-from tofcapture_model.data import batched, make_frame
+from tofcapture_model.data import batched, frame_decoder, make_frame
 from tofcapture_model.export import export
-from tofcapture_model.frame import Estimate, Frame
+from tofcapture_model.frame import Estimate, Frame, frame_to
 from tofcapture_model.joint import JointModel
 from tofcapture_model.onnx_backend import ask_onnx, open_onnx
-from tofcapture_model.predict import has_bfloat16
-from tofcapture_model.raw_input import NOMINAL_CAMERA
+from tofcapture_model.predict import has_bfloat16, predict_raw, recorded
+from tofcapture_model.raw_input import NOMINAL_CAMERA, RawInput
 from tofcapture_model.zoo import build_model
 
 
@@ -41,8 +44,45 @@ def raw_frame() -> np.ndarray:
 
 def in_half(model: JointModel, frame: Frame) -> Estimate:
     """Answer as `predict` does with a network that was trained in bfloat16."""
-    with torch.autocast("cpu", torch.bfloat16):
+    with torch.autocast(frame.raw.device.type, torch.bfloat16, cache_enabled=frame.raw.device.type != "cuda"):
         return model(frame)
+
+
+def seconds(call, device: str, repeats: int) -> float:
+    """Median time of a call, after three that do not count."""
+    times = []
+    for _ in range(repeats + 3):
+        started = time.perf_counter()
+        call()
+        if device != "cpu":
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - started)
+    return float(np.median(times[3:]))
+
+
+def throughput(model: JointModel, frame: Frame, batch: int, device: str, repeats: int) -> str:
+    """Frames per second of a batch that lies on the device, cues included, and its share of peak."""
+    kind = torch.device(device).type
+    model = model.to(device)
+    many = frame_to(Frame(*(x.expand(batch, *x.shape[1:]).contiguous() for x in frame)), torch.device(device))
+    answer = in_half if has_bfloat16(kind) else JointModel.__call__
+    with FlopCounterMode(display=False) as counter:
+        answer(model, many)
+    call = (lambda: answer(model, many)) if kind == "cpu" else None
+    if call is None:
+        launch = recorded(lambda f: answer(model, f)[:3], many)
+        call = lambda: launch(many)  # noqa: E731
+    taken = seconds(call, device, repeats)
+    side = 2048 if kind == "cpu" else 8192
+    kind_of = torch.bfloat16 if has_bfloat16(kind) else torch.float32
+    a, b = torch.randn(2, side, side, device=device).to(kind_of)
+    peak = 2 * side**3 / seconds(lambda: a @ b, device, repeats)
+    operations = counter.get_total_flops()
+    return (
+        f"batch of {batch}: {batch / taken:.1f} frames/s, {operations / batch / 1e9:.1f} GFLOP each, "
+        f"{operations / taken / 1e12:.2f} of {peak / 1e12:.2f} TFLOP/s that a matrix product of {side} reaches: "
+        f"{operations / taken / peak:.1%} of peak ({kind_of})"
+    )
 
 
 def main() -> None:
@@ -52,6 +92,8 @@ def main() -> None:
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     info, raw = TofInfo("benchmark", "", NOMINAL_CAMERA, np.zeros(3)), raw_frame()
@@ -61,9 +103,19 @@ def main() -> None:
             config = preset(args.preset)
             weights = save_model(Path(folder) / "model.safetensors", build_model(config), config, {})
         model, _, _ = load_model(weights)
-        frame = batched(make_frame(raw, info, NOMINAL_CAMERA))
+        decoder = frame_decoder(info, NOMINAL_CAMERA)
+        frame = batched(make_frame(raw, info, NOMINAL_CAMERA, decoder=decoder))
+        if args.device != "cpu":
+            burst = RawInput(raw[None], np.full(1, np.nan), info, NOMINAL_CAMERA)
+            found = predict_raw(burst, 0, weights, args.device)
+            print(
+                f"{args.device}: decode and copy {found.decode_ms:.2f} ms, cues and network {found.inference_ms:.2f} ms"
+            )
+            with torch.inference_mode():
+                print(throughput(model, frame, args.batch, args.device, args.repeats))
+            return
         calls = {
-            "decode and cues": lambda: make_frame(raw, info, NOMINAL_CAMERA),
+            "decode and cues": lambda: make_frame(raw, info, NOMINAL_CAMERA, decoder=decoder),
             "network, torch": lambda: model(frame),
         }
         if has_bfloat16("cpu"):
@@ -84,6 +136,7 @@ def main() -> None:
                     call()
                     wall[name].append(1000 * (time.perf_counter() - started))
                     cpu[name].append(1000 * (time.process_time() - used))
+            print(throughput(model, frame, args.batch, "cpu", 3))
     for name in calls:
         print(
             f"{name:16} {np.median(wall[name][2:]):7.1f} ms (fastest {min(wall[name]):.1f}; cpu {np.median(cpu[name][2:]):.1f})"

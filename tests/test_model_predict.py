@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
+
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from tofcapture.camera import Camera
 from tofcapture.cli import main
@@ -22,8 +26,9 @@ from tofcapture_model import checkpoint
 from tofcapture_model import predict as predicting
 from tofcapture_model.checkpoint import find_model, load_model, save_model
 from tofcapture_model.config import preset
-from tofcapture_model.data import make_frame
-from tofcapture_model.predict import predict, predict_raw
+from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
+from tofcapture_model.frame import Frame, frame_to
+from tofcapture_model.predict import predict, predict_raw, recorded
 from tofcapture_model.raw_input import NOMINAL_CAMERA, NOMINAL_RANGE_ERRORS, read_input
 from tofcapture_model.zoo import build_model
 
@@ -239,3 +244,62 @@ def test_half_the_mantissa_changes_less_than_noise_does(tmp_path, monkeypatch):
     turned = np.degrees(np.arccos(np.clip((half.normals * single.normals).sum(-1), -1, 1)))
     assert turned.mean() < 0.5
     np.testing.assert_allclose(np.median(half.error / single.error), 1, atol=0.02)
+
+
+class Hosts(TorchDispatchMode):
+    """Note every operation that touches a tensor of the host, or that hands a value to Python."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen, self.operations = [], 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        found = function(*args, **(kwargs or {}))
+        tensors = [x for x in tree_leaves((args, kwargs, found)) if isinstance(x, torch.Tensor)]
+        self.operations += 1
+        if any(x.device.type == "cpu" for x in tensors) or "_local_scalar" in function.__name__:
+            self.seen.append(str(function))
+        return found
+
+
+def test_a_prediction_neither_copies_from_the_host_nor_looks_at_a_value(monkeypatch):
+    """What a CUDA graph may hold: seen on the meta device, where a GPU's tensors would be; ``recorded`` relies on it."""
+    shapes = {
+        "raw": (8, 48, 64), "phasor": (4, 48, 64), "depth": (1, 48, 64), "valid": (1, 48, 64), "confidence": (1, 48, 64),
+        "gap": (1, 48, 64), "cues": (0,), "modulation": (2,), "intrinsics": (4,), "demodulation": (4, 8),
+    }  # fmt: skip
+    model = build_model(preset("compact")).eval().to("meta")
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # knows no meta device
+    with torch.inference_mode():
+        frame = Frame(**{name: torch.empty(2, *shape, device="meta") for name, shape in shapes.items()})
+        with Hosts() as hosts:
+            found = model(with_cues(frame, 100e6))
+    assert found.depth.shape == (2, 1, 96, 128)
+    assert hosts.operations > 500
+    assert hosts.seen == []
+
+
+@pytest.mark.gpu
+def test_a_recorded_prediction_is_the_prediction(weights, tmp_path):
+    """On a GPU the graph answers for a second frame as kernels launched one by one do, and as the processor does."""
+    arrays = [saved(tmp_path / f"{k}.npy", table_top(NOMINAL_CAMERA, seed=k)[0]) for k in (0, 1)]
+    model, _, _ = load_model(weights)
+    model = model.to("cuda")
+    frames = []
+    for path in arrays:
+        data = read_input(path)
+        decoder = frame_decoder(data.info, data.camera)
+        frame = make_frame(data.raw[0], data.info, data.camera, decoder=decoder)
+        frames.append(frame_to(batched(frame), torch.device("cuda")))
+
+    def ask(frame):
+        found = model(frame)
+        return found.depth, found.normals, found.error
+
+    with torch.inference_mode():
+        launch = recorded(ask, frames[0])
+        for frame in frames:
+            for one, other in zip(launch(frame), ask(frame), strict=True):
+                torch.testing.assert_close(one, other)
+    on_gpu, here = (predict_raw(read_input(arrays[0]), 0, weights, device) for device in ("cuda", "cpu"))
+    assert np.abs(on_gpu.depth - here.depth).mean() < 1e-3

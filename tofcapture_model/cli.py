@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import ctypes
 import os
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,8 @@ from tofcapture_model.config import Config, load_config, preset, presets
 from tofcapture_model.progress import progress
 from tofcapture_model.tables import SUITES
 
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # malloc.h
+
 
 def _share_cores() -> None:
     """Let idle OpenMP threads spin for microseconds only; must run before torch is imported.
@@ -23,6 +27,14 @@ def _share_cores() -> None:
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", "2000")
+
+
+def _keep_memory() -> None:
+    """Have glibc keep what is freed: it gives blocks of some MB back and asks for zeroed pages again, a sixth of a prediction's time."""
+    with suppress(OSError, AttributeError, TypeError):  # another system, another C library
+        libc = ctypes.CDLL(None)
+        libc.mallopt(_MMAP_THRESHOLD, 32 << 20)  # its largest
+        libc.mallopt(_TRIM_THRESHOLD, 1 << 30)
 
 
 def _device(parser: argparse.ArgumentParser) -> None:
@@ -223,6 +235,7 @@ def _configure_predict(parser: argparse.ArgumentParser) -> None:
 
 
 def _predict(args: argparse.Namespace) -> Outcome:
+    _keep_memory()
     from tofcapture_model.predict import predict
 
     result = predict(

@@ -68,10 +68,17 @@ def make_frame(
     decoder
         :func:`frame_decoder` of the same camera; ``None`` builds its tables anew, which takes as long as some frames.
     """
-    maps, signals = (decoder or frame_decoder(info, camera)).signals(raw, celsius)
+    decoded = decode_frame(raw, info, camera, celsius, decoder or frame_decoder(info, camera))
+    whole = with_cues(batched(decoded), frequencies(info.modulation_hz)[1])
+    return decoded._replace(cues=whole.cues[0])
+
+
+def decode_frame(raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float, decoder: Decoder) -> Frame:
+    """Do the first part of :func:`make_frame`, which is the processor's: everything but the cues, which are empty."""
+    maps, signals = decoder.signals(raw, celsius)
     depth = maps.depth
     valid = np.isfinite(depth) & (depth > 0.05) & (depth < MAX_RANGE)
-    frame = Frame(
+    return Frame(
         raw=_tensor(raw) / info.saturation,
         phasor=_tensor(signals.phasor.reshape(4, *depth.shape)) / info.saturation,
         depth=_tensor(fill_nearest(depth, valid)[None]),
@@ -83,11 +90,11 @@ def make_frame(
         intrinsics=torch.tensor([camera.pinhole("network input").fx, camera.fy, camera.cx, camera.cy]),
         demodulation=_tensor(tap_weights(info)[[0, 2, 1, 3]]),
     )
-    whole = batched(frame)
-    high = frequencies(info.modulation_hz)[1]
-    return frame._replace(
-        cues=cues(whole.phasor, whole.depth, whole.valid, whole.gap, whole.intrinsics, high)[0]
-    )
+
+
+def with_cues(frame: Frame, hz: float) -> Frame:
+    """Do the second part, on the frame's device: a batch of decoded frames with their cues; ``hz`` is the high frequency."""
+    return frame._replace(cues=cues(frame.phasor, frame.depth, frame.valid, frame.gap, frame.intrinsics, hz))
 
 
 def frame_decoder(info: TofInfo, camera: Camera) -> Decoder:

@@ -67,26 +67,26 @@ def offsets(radius: int, step: int = 1) -> Iterator[tuple[int, int]]:
     return ((dy, dx) for dy in reach for dx in reach if (dy, dx) != (0, 0))
 
 
-def _moment_filters(radius: int) -> tuple[Tensor, Tensor]:
-    """(6, 3, 1, k) along rows and (10, 6, k, 1) along columns: which power of u, then of v, of which image."""
-    r = torch.arange(-radius, radius + 1, dtype=torch.float64)
-    powers = [torch.ones_like(r), r, r * r]
-    rows, columns = (torch.zeros(o, i, len(r), dtype=torch.float64) for o, i in ((6, 3), (10, 6)))
-    for out, (image, power) in enumerate(((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0))):
-        rows[out, image] = powers[power]
-    for out, (row, power) in enumerate(
-        ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (4, 0), (3, 1), (5, 0))
-    ):
-        columns[out, row] = powers[power]
-    return rows[:, :, None], columns[..., None]
+def _moment_filters(radius: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """(6, 3, 1, k) along rows and (10, 6, k, 1) along columns: powers of u of each image, then of v of each of those.
+
+    They are made where they are used: a copy from the host would keep a GPU waiting, and cannot be part of a CUDA graph.
+    """
+    r = torch.arange(-radius, radius + 1, dtype=like.dtype, device=like.device)
+    powers = torch.stack([torch.ones_like(r), r, r * r])
+    rows, columns = (
+        torch.block_diag(*(powers[:n] for n in counts))  # type: ignore[no-untyped-call]
+        for counts in ((3, 2, 1), (3, 2, 1, 2, 1, 1))
+    )
+    return rows.reshape(6, 3, 1, -1), columns.reshape(10, 6, -1, 1)
 
 
 def _moments(images: Tensor, radius: int) -> Tensor:
-    """(B, 10, H, W) sums over every window of images (B, 3, H, W) a, b, c: ``a (1, u, v, uu, uv, vv), b (1, u, v), c``.
+    """Sums (B, 10, H, W) over every window of images (B, 3, H, W) a, b, c: ``a (1, v, vv, u, uv, uu), b (1, v, u), c``.
 
     All at once: convolutions of one channel run at a fraction of a processor's speed.
     """
-    rows, columns = (f.to(images) for f in _moment_filters(radius))
+    rows, columns = _moment_filters(radius, images)
     with torch.autocast(images.device.type, enabled=False):  # eight bits of mantissa hold no moments
         return F.conv2d(F.conv2d(images, rows, padding=(0, radius)), columns, padding=(radius, 0))
 
@@ -114,7 +114,7 @@ def local_planes(depth: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Ten
     origin = inverse.mean(dim=(2, 3), keepdim=True)  # float32 moments cancel badly far from zero
     i = (inverse - origin) * valid
     images = torch.cat([valid, i, i * (inverse - origin)], dim=1)
-    s1, su, sv, suu, suv, svv, t1, tu, tv, tt = _moments(images, radius).unbind(1)
+    s1, sv, svv, su, suv, suu, t1, tv, tu, tt = _moments(images, radius).unbind(1)
     # a window with one row or column of pixels has a slope of zero across it
     ridge = 10 * torch.finfo(depth.dtype).eps * suu + _TINY
     n = s1.clamp_min(_TINY)

@@ -156,7 +156,9 @@ class Raw2Depth(nn.Module):
 
     def forward(self, shared: Tensor, features: Features, frame: Frame) -> Tensor:
         """Return depth (B, 1, 2H, 2W), metres."""
-        gates, residual, logits = self.net(shared).float().split([self.candidates, 1, CONVEX_CHANNELS], dim=1)
+        # a plane for each channel: the softmax over neighbours would copy pixels with channels side by side twice
+        out = self.net(shared).to(torch.float32, memory_format=torch.contiguous_format)
+        gates, residual, logits = out.split([self.candidates, 1, CONVEX_CHANNELS], dim=1)
         steps = (gates * (features.candidates - frame.depth)).sum(1, keepdim=True)
         start = frame.depth if self.decoded else torch.full_like(frame.depth, MIDDLE)
         unit_of = RESIDUAL_UNIT if self.decoded else REACH

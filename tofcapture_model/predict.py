@@ -19,8 +19,9 @@ from torch import Tensor
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError
 from tofcapture.files.seal import write_text
+from tofcapture.ops.phase import frequencies
 from tofcapture_model.checkpoint import find_model, load_model
-from tofcapture_model.data import batched, frame_decoder, make_frame
+from tofcapture_model.data import batched, decode_frame, frame_decoder, make_frame, with_cues
 from tofcapture_model.frame import Frame, frame_to
 from tofcapture_model.raw_input import RawInput, read_input
 
@@ -45,9 +46,10 @@ class Prediction:
     camera
         Intrinsics of the (2H, 2W) grid.
     inference_ms
-        Median time of the network, after loading and decoding.
+        Median time of the network, after loading and decoding; on a GPU with that of the physical cues.
     decode_ms
-        Median time of decoding the raw frame and of the physical cues, after the camera's tables are built.
+        Median time of decoding the raw frame, after the camera's tables are built, and of the physical cues; on a GPU of decoding and
+        of the way there.
     """
 
     depth: Float32
@@ -81,12 +83,19 @@ def predict_raw(
     taken = slice(None) if frame is None else slice(frame, frame + 1)
     raw, celsius = data.raw[taken].mean(axis=0, dtype=np.float64), float(data.celsius[taken].mean())
     ask = _onnx_model(weights, data.camera) if backend == "onnx" else _torch_model(weights, device)
-    decoder = frame_decoder(data.info, data.camera)
-    wait: Callable[[], None] = torch.cuda.synchronize if device.startswith("cuda") else lambda: None
+    decoder, place = frame_decoder(data.info, data.camera), torch.device(device)
+    parts = (raw, data.info, data.camera, celsius, decoder)
+    on_gpu = place.type == "cuda" and backend == "torch"
+    wait: Callable[[], None] = torch.cuda.synchronize if on_gpu else lambda: None
     with torch.inference_mode():
-        decoded, decode_ms = _timed(lambda: make_frame(raw, data.info, data.camera, celsius, decoder), wait)
-        inputs = frame_to(batched(decoded), torch.device(device))
-        (depth, normals, error), inference_ms = _timed(lambda: ask(inputs), wait)
+        if on_gpu:
+            hz = frequencies(data.info.modulation_hz)[1]
+            inputs, decode_ms = _timed(lambda: frame_to(batched(decode_frame(*parts)), place), wait)
+            launch = recorded(lambda frame: ask(with_cues(frame, hz)), inputs)
+        else:
+            decoded, decode_ms = _timed(lambda: make_frame(*parts), wait)
+            inputs, launch = batched(decoded), ask
+        (depth, normals, error), inference_ms = _timed(lambda: launch(inputs), wait)
     return Prediction(
         depth=depth[0, 0].cpu().numpy(),
         error=error[0, 0].cpu().numpy(),
@@ -111,6 +120,42 @@ def _timed(work: Callable[[], T], wait: Callable[[], None]) -> tuple[T, float]:
 Ask = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
 
 
+def recorded(ask: Ask, like: Frame) -> Ask:
+    """Record what a GPU does for a frame as a CUDA graph, so that every further one takes a single launch.
+
+    A prediction is more than a thousand small kernels; launching them one by one takes longer than running them.
+
+    Parameters
+    ----------
+    ask
+        Depth, normals and error of a batch, without a look at any value on the way and without copies from the host.
+    like
+        Of the shapes and on the device of all frames to come.
+
+    Returns
+    -------
+    The same question; an answer lasts until the next one.
+    """
+    held = Frame(*(x.clone() for x in like))
+    beside = torch.cuda.Stream(like.raw.device)  # type: ignore[no-untyped-call]
+    beside.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(beside):  # libraries choose and allocate on first use, which cannot be recorded
+        for _ in range(WARM):
+            ask(held)
+    torch.cuda.current_stream().wait_stream(beside)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        answer = ask(held)
+
+    def replay(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        for place, new in zip(held, frame, strict=True):
+            place.copy_(new)
+        graph.replay()
+        return answer
+
+    return replay
+
+
 def _torch_model(weights: Path | None, device: str) -> Ask:
     """Compute as it was trained: in bfloat16 if that is how it learned, and where the processor has it."""
     model, config, _ = load_model(weights)
@@ -119,7 +164,8 @@ def _torch_model(weights: Path | None, device: str) -> Ask:
     half = config.training.precision == "bfloat16" and has_bfloat16(kind)
 
     def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        with torch.autocast(kind, torch.bfloat16, enabled=half):
+        # weights that are cast and kept would be lost to a graph that was recorded with them
+        with torch.autocast(kind, torch.bfloat16, enabled=half, cache_enabled=kind != "cuda"):
             found = model(frame)
         return found.depth, found.normals, found.error
 
