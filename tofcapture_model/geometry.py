@@ -185,15 +185,16 @@ def side_window_planes(
     precise = 1 / (variance + floor**2)
     weight = precise * precise * precise  # a power takes ten times as long
     weight = weight / weight.amax(dim=(2, 3), keepdim=True)
-    packed = torch.cat([planes, variance, weight], dim=1)
-    total = torch.zeros_like(planes)
-    norm = torch.full_like(weight, 1e-30)
-    best = torch.full_like(variance, torch.inf)
-    for dy, dx in ((y, x) for y in (-radius, 0, radius) for x in (-radius, 0, radius)):
-        c, a, b, var, w = shifted(packed, dy, dx).chunk(5, dim=1)
-        total = total + w * torch.cat([c - a * dx - b * dy, a, b], dim=1)
-        norm, best = norm + w, torch.minimum(best, var)
-    return total / norm, best
+    # a window says c + a dx + b dy of the pixel (dx, dy) from its centre; the sum over nine goes along rows, then along columns
+    packed, best = torch.cat([planes * weight, weight], dim=1), variance
+    for slope, step in ((1, (0, radius)), (2, (radius, 0))):
+        before, after = (shifted(packed, way * step[0], way * step[1]) for way in (-1, 1))
+        moved = radius * (before[:, slope] - after[:, slope])[:, None]
+        packed = before + packed + after
+        packed = torch.cat([packed[:, :1] + moved, packed[:, 1:]], dim=1)
+        sides = [shifted(best, way * step[0], way * step[1]) for way in (-1, 1)]
+        best = torch.minimum(best, torch.minimum(*sides))
+    return packed[:, :3] / packed[:, 3:].clamp_min(1e-30), best
 
 
 def propagate_depth(
