@@ -57,8 +57,8 @@ def shifted(image: Tensor, dy: int, dx: int) -> Tensor:
 
 def doubled_parts(image: Tensor) -> Tensor:
     """Bilinear x2 (B, C, 4, H, W), the four sub-pixels beside each other: what ``pixel_shuffle`` of (B, 4C, H, W) interleaves."""
-    across = [0.75 * image + 0.25 * shifted(image, 0, dx) for dx in (-1, 1)]
-    return torch.stack([0.75 * a + 0.25 * shifted(a, dy, 0) for dy in (-1, 1) for a in across], dim=2)
+    across = [torch.lerp(image, shifted(image, 0, dx), 0.25) for dx in (-1, 1)]
+    return torch.stack([torch.lerp(a, shifted(a, dy, 0), 0.25) for dy in (-1, 1) for a in across], dim=2)
 
 
 def offsets(radius: int, step: int = 1) -> Iterator[tuple[int, int]]:

@@ -142,6 +142,11 @@ def sees_decoded(network: Network) -> bool:
     return network.kind != "paper" or "depth" in network.inputs
 
 
+def _planes(image: Tensor) -> Tensor:
+    """Single precision, a plane for each channel: what takes channels apart is slow where they lie side by side, as convolutions leave them."""
+    return image.to(torch.float32, memory_format=torch.contiguous_format)
+
+
 class Raw2Depth(nn.Module):
     """Decoded depth + gated steps to its candidates + residual, then convex upsampling; without it, depth about ``MIDDLE``."""
 
@@ -156,9 +161,8 @@ class Raw2Depth(nn.Module):
 
     def forward(self, shared: Tensor, features: Features, frame: Frame) -> Tensor:
         """Return depth (B, 1, 2H, 2W), metres."""
-        # a plane for each channel: the softmax over neighbours would copy pixels with channels side by side twice
-        out = self.net(shared).to(torch.float32, memory_format=torch.contiguous_format)
-        gates, residual, logits = out.split([self.candidates, 1, CONVEX_CHANNELS], dim=1)
+        out = _planes(self.net(shared))
+        gates, residual, logits = torch.split(out, [self.candidates, 1, CONVEX_CHANNELS], dim=1)
         steps = (gates * (features.candidates - frame.depth)).sum(1, keepdim=True)
         start = frame.depth if self.decoded else torch.full_like(frame.depth, MIDDLE)
         unit_of = RESIDUAL_UNIT if self.decoded else REACH
@@ -210,13 +214,12 @@ class Raw2Normal(nn.Module):
         if not self.fits:
             return unit(doubled(features.normals) + F.pixel_shuffle(self.net(shared).float(), 2))
         fitted = self._fitted(depth, frame)
-        out = self.net(torch.cat([shared, features.normals, *fitted], dim=1)).float()
+        out = _planes(self.net(torch.cat([shared, features.normals, *fitted], dim=1)))
         # sub-pixels side by side until the end: interpolating and interleaving each term costs more than the convolutions
-        parts = out.unflatten(1, (-1, 4))
-        start = doubled_parts(features.normals)
-        normals = start + parts[:, :3]
+        parts = out.reshape(len(out), -1, 4, *out.shape[-2:])
+        normals = doubled_parts(features.normals) + parts[:, :3]
         for k, n in enumerate(fitted, 3):
-            normals = normals + parts[:, k : k + 1] * (doubled_parts(n) - start)
+            normals = torch.addcmul(normals, parts[:, k : k + 1], doubled_parts(n - features.normals))
         return F.pixel_shuffle(unit(normals).flatten(1, 2), 2)
 
     def _fitted(self, depth: Tensor, frame: Frame) -> list[Tensor]:

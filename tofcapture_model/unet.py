@@ -123,5 +123,5 @@ def convex_upsample(image: Tensor, logits: Tensor) -> Tensor:
     out = torch.zeros(b, c, 4, h, w, dtype=image.dtype, device=image.device)
     # indexing would fill a whole gradient for each of the nine
     for k, weight in enumerate(weights.unbind(1)):
-        out = out + shifted(image, k // 3 - 1, k % 3 - 1)[:, :, None] * weight[:, None]
+        out = torch.addcmul(out, shifted(image, k // 3 - 1, k % 3 - 1)[:, :, None], weight[:, None])
     return F.pixel_shuffle(out.reshape(b, c * 4, h, w), 2)
