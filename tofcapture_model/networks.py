@@ -216,7 +216,7 @@ class Raw2Normal(nn.Module):
         fitted = self._fitted(depth, frame)
         out = _planes(self.net(torch.cat([shared, features.normals, *fitted], dim=1)))
         # sub-pixels side by side until the end: interpolating and interleaving each term costs more than the convolutions
-        parts = out.reshape(len(out), -1, 4, *out.shape[-2:])
+        parts = torch.unflatten(out, 1, (-1, 4))
         normals = doubled_parts(features.normals) + parts[:, :3]
         for k, n in enumerate(fitted, 3):
             normals = torch.addcmul(normals, parts[:, k : k + 1], doubled_parts(n - features.normals))
