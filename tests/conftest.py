@@ -1,5 +1,7 @@
 """Fixtures that more than one file of tests uses."""
 
+import shutil
+
 import pytest
 
 
@@ -17,3 +19,23 @@ def emulator(running):
     """The emulator at rest, without faults."""
     running.calm()
     return running
+
+
+@pytest.fixture(scope="session")
+def sealed(tmp_path_factory):
+    """A recording of two scenes and the dataset built from it."""
+    from tests.sealed import simulate
+    from tofcapture.dataset.build import build_dataset
+    from tofcapture.files.view import view_path, write_view
+
+    root = tmp_path_factory.mktemp("check")
+    for scene in ("box", "gear"):
+        write_view(view_path(root / "recording", scene, 0), simulate(scene, 0))
+    build_dataset([root / "recording"], root / "dataset", true_rig=True, jobs=1)
+    return root
+
+
+@pytest.fixture
+def here(sealed, tmp_path):
+    """A copy to damage."""
+    return shutil.copytree(sealed, tmp_path / "copy")

@@ -6,11 +6,9 @@ import json
 import os
 import pickle
 import shutil
-import sqlite3
 import subprocess
 import sys
 import time
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,68 +16,14 @@ import h5py
 import numpy as np
 import pytest
 
+from tests.sealed import delete, edit, replaced, reseal, set_array, set_attr, simulate
 from tests.test_files_shard import write
-from tofcapture.dataset.build import build_dataset
-from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
-from tofcapture.devices.sim.world import SimWorld, read_constants
 from tofcapture.errors import DataError
 from tofcapture.files import seal as sealing
-from tofcapture.files.cache import pack
 from tofcapture.files.check import check
-from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
-from tofcapture.files.migrate import migrate
-from tofcapture.files.seal import digest_path, sha256_of
+from tofcapture.files.seal import digest_path
 from tofcapture.files.shard import ShardReader
-from tofcapture.files.view import view_path, write_view
-from tofcapture.frames import ArmState, View
-from tofcapture.poses import invert, look_at
-
-SMALL = {
-    "tof": {"width": 40, "height": 30, "fx": 31.8, "fy": 33.4, "cx": 19.5, "cy": 16.9},
-    "stereo": {"width": 160, "height": 128, "fx": 144.0, "fy": 144.0, "cx": 79.5, "cy": 63.5},
-    "render": {"multipath": False, "subpixels": 1},
-}
-
-
-def simulate(scene, index):
-    world = SimWorld(read_constants(SMALL, "test"), 0, scene_objects)
-    target = np.asarray(TABLE_CENTRE) + np.array([0, 0, 0.03])
-    T_base_tof = look_at(target + np.array([0.1 * index, 0.15, 0.45]), target)
-    T_base_flange = T_base_tof @ invert(world.true_rig.T_flange_tof)
-    world.place(scene)
-    world.set_pose(T_base_flange, bytes([index]))
-    times = iter(range(1, 10**9, 10**6))
-    burst, stereo = world.tof(2, times.__next__), world.stereo(times.__next__)
-    state = ArmState(np.zeros(6), T_base_flange, 5)
-    return View(scene, index, burst, stereo, state, state, world.nominal_rig(), {}, world.truth())
-
-
-@pytest.fixture(scope="module")
-def sealed(tmp_path_factory):
-    """A recording of two scenes and the dataset built from it."""
-    root = tmp_path_factory.mktemp("check")
-    for scene in ("box", "gear"):
-        write_view(view_path(root / "recording", scene, 0), simulate(scene, 0))
-    build_dataset([root / "recording"], root / "dataset", true_rig=True, jobs=1)
-    return root
-
-
-@pytest.fixture
-def here(sealed, tmp_path):
-    """A copy to damage."""
-    return shutil.copytree(sealed, tmp_path / "copy")
-
-
-def reseal(path):
-    """Make the stored digest agree with damaged bytes, so that deeper checks have to find the damage."""
-    digest_path(path).write_text(f"{sha256_of(path)}  {path.name}\n")
-
-
-def edit(path, change):
-    path.chmod(0o644)
-    with h5py.File(path, "a") as file:
-        change(file)
-    reseal(path)
+from tofcapture.files.view import write_view
 
 
 def test_what_is_right_has_no_problems(sealed):
@@ -128,28 +72,6 @@ def test_chunk_checksums_name_the_dataset(here):
     path.write_bytes(bytes(data))
     reseal(path)
     assert [p.where for p in check(path)] == ["/gt/depth_2x"]
-
-
-def set_attr(name, value):
-    return lambda f: f.attrs.__setitem__(name, value)
-
-
-def set_array(name, index, value):
-    return lambda f: f[name].__setitem__(index, value)
-
-
-def delete(name):
-    return lambda f: f.__delitem__(name)
-
-
-def replaced(name, array):
-    def change(file):
-        units = file[name].attrs["units"]
-        del file[name]
-        file[name] = array
-        file[name].attrs["units"] = units
-
-    return change
 
 
 SHARD_DAMAGE = {
@@ -254,66 +176,6 @@ def test_what_is_no_hdf5_is_found(here, content):
     assert check(here)[0].message.startswith("expected a recording")
 
 
-def test_a_recording_disagrees_with_its_journal(here):
-    """A view that the journal promises and that is gone, or that is another one, is found; a broken journal is too."""
-    recording = here / "recording"
-    with closing(sqlite3.connect(recording / "journal.sqlite")) as db:
-        db.execute('CREATE TABLE views (scene, "index", state, sha256)')
-        for row in (
-            ("box", 0, "sealed", "0" * 64),
-            ("box", 1, "sealed", "1" * 64),
-            ("box", 2, "failed", None),
-        ):
-            db.execute("INSERT INTO views VALUES (?, ?, ?, ?)", row)
-        db.commit()
-    problems = {p.path.name: p.message for p in check(recording)}
-    assert set(problems) == {"view-000.h5", "view-001.h5"}
-    assert "journal" in problems["view-000.h5"]
-    (recording / "journal.sqlite").write_text("no database " * 100)
-    (recording / "rig.toml").write_text("units = 'mm'")
-    (recording / "evidence.json").write_text("{")
-    assert {p.path.name for p in check(recording)} == {"journal.sqlite", "rig.toml", "evidence.json"}
-
-
-def test_a_dataset_disagrees_with_its_manifest(here):
-    """A missing shard, a shard that nobody lists, a wrong count, a wrong digest, an object in two splits."""
-    dataset = here / "dataset"
-    manifest = json.loads((dataset / "manifest.json").read_text())
-    scenes = manifest["scenes"]
-    shutil.copy(dataset / "shards/box.h5", dataset / "shards/box-2.h5")
-    edit(dataset / "shards/box-2.h5", set_attr("scene", "box-2"))
-    scenes["box-2"] = {
-        **scenes["box"],
-        "path": "shards/box-2.h5",
-        "sha256": sha256_of(dataset / "shards/box-2.h5"),
-    }
-    scenes["box-2"]["split"] = "test" if scenes["box"]["split"] == "train" else "train"
-    scenes["box"]["views"] = 4
-    scenes["gone"] = {**scenes["gear"], "path": "shards/gone.h5"}
-    scenes["gear"]["sha256"] = "0" * 64
-    shutil.copy(dataset / "shards/gear.h5", dataset / "shards/stray.h5")
-    write_manifest(dataset, Manifest({n: SceneEntry(**e) for n, e in scenes.items()}))
-    found = {(p.path.name, p.where) for p in check(dataset)}
-    assert found == {
-        ("manifest.json", "box"),
-        ("gone.h5", ""),
-        ("gear.h5", ""),
-        ("stray.h5", ""),
-        ("box-2.h5", "view 0"),
-        ("croissant.json", "distribution"),
-    }
-    assert any("box" in p.where and "is in" in p.message for p in check(dataset))
-
-
-def test_a_dataset_without_a_readable_manifest(here):
-    """A manifest that is gone or no JSON is one problem, not an exception."""
-    path = here / "dataset/manifest.json"
-    path.write_text("{")
-    assert [p.path.name for p in check(here / "dataset")] == ["dataset"]
-    path.unlink()
-    assert len(check(here / "dataset")) == 1
-
-
 def test_the_command(here):
     """`tofcapture check` exits with 0, 5 and 3 and speaks JSON."""
 
@@ -343,63 +205,6 @@ def test_simulated_views_of_other_poses_are_fine(tmp_path):
     path = tmp_path / "views/box/view-003.h5"
     write_view(path, replace(simulate("box", 3), truth=None))
     assert check(path) == []
-
-
-def as_scene(dataset, old, new, change=lambda _file: None):
-    """Copy a shard as another scene's; returns its entry of the manifest."""
-    path = dataset / f"shards/{new}.h5"
-    shutil.copy(dataset / f"shards/{old}.h5", path)
-    edit(path, lambda f: (set_attr("scene", new)(f), change(f)))
-    return replace(load_manifest(dataset).scenes[old], path=f"shards/{new}.h5", sha256=sha256_of(path))
-
-
-def test_the_same_frames_under_two_names_are_found(here):
-    """A view that is in two scenes, whatever else differs, and one that is twice in a scene."""
-    dataset = here / "dataset"
-    manifest = load_manifest(dataset)
-    entry = as_scene(dataset, "box", "cup", set_array("tof/celsius", (0, 0), 20.0))
-    write_manifest(dataset, replace(manifest, scenes={**manifest.scenes, "cup": entry}))
-    found = [(p.path.name, p.where, p.message) for p in check(dataset) if p.path.name != "croissant.json"]
-    assert found == [("cup.h5", "view 0", "the same frames as view 0 of box")]
-
-
-def test_an_object_in_two_splits_is_found_by_what_the_data_say(here):
-    """Scenes of other names share an object: by their provenance, or by the simulation's note."""
-    dataset = here / "dataset"
-    manifest = load_manifest(dataset)
-    noisy = set_array("tof/raw", (0, 0, 0, 0), 7)
-    objects = set_attr("provenance", json.dumps({"objects": ["bowl"]}))
-    one = as_scene(dataset, "box", "cup", lambda f: (noisy(f), objects(f)))
-    write_manifest(dataset, replace(manifest, scenes={**manifest.scenes, "cup": replace(one, split="val")}))
-    (dataset / "simulation").mkdir()
-    (dataset / "simulation/gear.json").write_text(json.dumps({"objects": ["bowl"]}))
-    problems = [p for p in check(dataset) if p.path.name == "manifest.json"]
-    assert [p.where for p in problems] == ["bowl"]
-    assert "val (cup)" in problems[0].message
-
-
-def test_strays_and_stale_caches_are_found(here):
-    """Files that nobody lists; a cache in the dataset that is damaged, then stale; the same cache looked at by itself."""
-    dataset = here / "dataset"
-    split = load_manifest(dataset).scenes["box"].split
-    pack(dataset, split, dataset / "cache")
-    (dataset / "LICENSE").write_text("x")
-    assert check(dataset) == []
-    assert check(dataset / "cache") == []
-    (dataset / "shards/notes.txt").write_text("x")
-    (dataset / "old.h5").write_text("x")
-    (dataset / "cache/extra").write_text("x")
-    assert {p.path.name for p in check(dataset)} == {"notes.txt", "old.h5", "extra"}
-    path = dataset / "cache/box.bin"
-    data = bytearray(path.read_bytes())
-    data[1000] ^= 1
-    path.write_bytes(data)
-    assert "box.bin" in {p.path.name for p in check(dataset / "cache")}
-    edit(dataset / "shards/box.h5", set_array("tof/celsius", (0, 0), 20.0))
-    manifest = load_manifest(dataset)
-    box = replace(manifest.scenes["box"], sha256=sha256_of(dataset / "shards/box.h5"))
-    write_manifest(dataset, replace(manifest, scenes={**manifest.scenes, "box": box}))
-    assert any("stale: box" in p.message for p in check(dataset))
 
 
 def test_random_damage_is_reported_and_never_read(tmp_path):
@@ -440,16 +245,3 @@ def test_a_reader_hashes_a_file_once(here, monkeypatch):
     with pytest.raises(DataError, match="sha256"):
         ShardReader(path).views  # noqa: B018
     assert hashed == [path, path]
-
-
-def test_a_manifest_of_the_first_version(here):
-    """It is read as it was; check says that it does not vouch for itself; migrate signs it."""
-    dataset = here / "dataset"
-    path = dataset / "manifest.json"
-    manifest, table = load_manifest(dataset), json.loads(path.read_text())
-    del table["sha256"]
-    path.write_text(json.dumps({**table, "version": 1}, indent=1, sort_keys=True) + "\n")
-    assert load_manifest(dataset) == manifest
-    assert [p.hint.split()[1] for p in check(dataset) if p.path.name == "manifest.json"] == ["migrate"]
-    migrate(dataset)
-    assert check(dataset) == []
