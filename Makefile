@@ -10,7 +10,7 @@ STAMP := $(VENV)/.installed
 # make demo TORCH="torch==2.13.0 --index-url ..." with the address that PyTorch's install page gives.
 TORCH ?= $(shell command -v nvidia-smi >/dev/null 2>&1 && echo "torch" || echo "torch==2.13.0")
 
-.PHONY: demo test lint docs clean
+.PHONY: demo test lint docs gpu clean
 .DELETE_ON_ERROR:
 
 $(STAMP): pyproject.toml
@@ -37,6 +37,12 @@ docs: $(STAMP)
 	$(VENV)/bin/python -m tofcapture.files.page > docs/formats.md
 	$(VENV)/bin/python -m tofcapture.record.daemon.schema > docs/openapi.json
 	$(VENV)/bin/python -m sphinx -q -W --keep-going -b html docs build/docs
+
+# What needs an NVIDIA GPU: its tests, and the times that no other machine can tell.
+gpu: $(STAMP)
+	$(VENV)/bin/python -m pytest -m gpu
+	$(VENV)/bin/python benchmarks/chamfer.py --device cuda
+	$(VENV)/bin/python benchmarks/predict.py --device cuda --preset compact
 
 clean:
 	rm -rf $(VENV)
