@@ -42,7 +42,7 @@ docs: $(STAMP)
 gpu: $(STAMP)
 	$(VENV)/bin/python -m pytest -m gpu
 	$(VENV)/bin/python benchmarks/chamfer.py --device cuda
-	$(VENV)/bin/python benchmarks/predict.py --device cuda --preset compact
+	$(VENV)/bin/python benchmarks/predict.py --device cuda
 
 clean:
 	rm -rf $(VENV)

@@ -1,8 +1,8 @@
 """Latency of one frame: decode and network, by backend, on two threads or a GPU; throughput of batches.
 
-    python benchmarks/predict.py [--preset compact] [--weights RUN] [--repeats 20] [--batch 8] [--device cuda]
+    python benchmarks/predict.py [--preset NAME | --weights RUN] [--repeats 20] [--batch 8] [--device cuda]
 
-240 x 180 raw to 480 x 360 depth, normals and uncertainty, after loading. Wall and CPU time, medians, backends in turns. Throughput
+240 x 180 raw to 480 x 360 depth, normals and uncertainty, after loading, by the bundled network, a run's or an untrained preset's. Wall and CPU time, medians, backends in turns. Throughput
 comes with its share of peak: operations of convolutions and matrix products per second, over those of one large matrix product in
 the same precision, run beside it.
 """
@@ -88,8 +88,9 @@ def throughput(model: JointModel, frame: Frame, batch: int, device: str, repeats
 def main() -> None:
     """Print one line per stage."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--preset", default="compact")
-    parser.add_argument("--weights", type=Path)
+    network = parser.add_mutually_exclusive_group()
+    network.add_argument("--preset")
+    network.add_argument("--weights", type=Path)
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--batch", type=int, default=8)
@@ -99,7 +100,7 @@ def main() -> None:
     info, raw = TofInfo("benchmark", "", NOMINAL_CAMERA, np.zeros(3)), raw_frame()
     with tempfile.TemporaryDirectory() as folder:
         weights = args.weights
-        if weights is None:
+        if args.preset:
             config = preset(args.preset)
             weights = save_model(Path(folder) / "model.safetensors", build_model(config), config, {})
         model, _, _ = load_model(weights)
