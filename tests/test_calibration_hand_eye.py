@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
@@ -11,48 +10,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration import calibrate_cli
 from calibration.hand_eye import refine_from_consensus, solve_hand_eye, to_dict
 from calibration.hand_eye_closed import daniilidis, invert_all, park_martin, residuals, shah
 from calibration.hand_eye_files import read_csv, read_pairs
 from calibration.hand_eye_refine import jacobian
 from calibration.hand_eye_refusal import Cause, HandEyeRefused
 from calibration.time_offset import coarse_offset, make_stream, pairs_at, refine_offset
-from tofcapture.errors import DataError, FormatError, UsageError
-from tofcapture.poses import exp, invert, look_at, rotation_angle, rotation_exp, rotation_log, transform
+from tests.hand_eye import apart, station, streams
+from tofcapture.errors import DataError
+from tofcapture.poses import exp, invert, rotation_exp, rotation_log, transform
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "realdata"
 MOVEIT = REAL / "hand_eye_moveit" / "pose_samples.json"
 ETH = REAL / "hand_eye_ethz" / "robot_arm"
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=10, deadline=None)
-
-
-def station(seed=0, count=25, noise_m=0.0005, noise_rad=0.001, eye_to_hand=False):
-    """Hand and target poses of a camera that looks at a board from all sides, and the true X."""
-    rng = np.random.default_rng(seed)
-    X = exp(rng.normal(0, [0.06, 0.06, 0.06, 0.8, 0.8, 0.8]))
-    board = transform(np.eye(3), [0.6, 0.1, 0.0])
-    hand, target = [], []
-    for _ in range(count):
-        tilt, turn, far = rng.uniform(0.1, 0.6), rng.uniform(0, 2 * np.pi), rng.uniform(0.4, 0.8)
-        way = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
-        camera = look_at(
-            board[:3, 3] + far * way, board[:3, 3] + rng.normal(0, 0.03, 3), (1, 0, 0), rng.uniform(-1, 1)
-        )
-        B = invert(camera) @ board
-        hand.append(camera @ invert(X))
-        target.append(
-            transform(
-                rotation_exp(rng.normal(0, noise_rad, 3)) @ B[:3, :3], B[:3, 3] + rng.normal(0, noise_m, 3)
-            )
-        )
-    A = np.stack(hand)
-    return (invert_all(A) if eye_to_hand else A), np.stack(target), X
-
-
-def apart(X, Y):
-    return rotation_angle(X[:3, :3] @ Y[:3, :3].T), np.linalg.norm(X[:3, 3] - Y[:3, 3])
 
 
 def refused(hand, target, **how):
@@ -283,22 +255,6 @@ def test_eth_streams_repeat():
     assert refused(A, invert_all(B)) == Cause.TARGET_INVERTED
 
 
-def streams(offset, seed=0, period=None):
-    """A smooth irregular (or periodic) motion, seen by a hand at 100 Hz and a camera at 30 Hz whose clock is off."""
-    rng = np.random.default_rng(seed)
-    X, Z = exp([0.05, 0.02, 0.08, 0.3, -0.5, 0.8]), exp([0.6, 0, 0, 0, 0, 0.4])
-    rate = rng.uniform(0.5, 3, (4, 6)) if period is None else np.full((4, 6), 2 * np.pi / period)
-    phase, size = rng.uniform(0, 6, (4, 6)), np.r_[[0.04] * 3, [0.25] * 3]
-
-    def at(t):
-        return exp(size * np.sin(rate * t + phase).sum(axis=0))
-
-    t_hand, t_camera = np.arange(0, 20, 0.01), np.arange(1, 18, 1 / 30)
-    hand = np.stack([at(t) for t in t_hand])
-    target = np.stack([invert(X) @ invert(at(t)) @ Z @ exp(rng.normal(0, 5e-4, 6)) for t in t_camera])
-    return make_stream(t_hand, hand, "hand"), make_stream(t_camera - offset, target, "target"), X
-
-
 @pytest.mark.parametrize("offset", [0.137, 1e6])
 def test_time_offset_is_found(offset):
     """Clocks that differ by a few frames or by an epoch are brought together to two milliseconds."""
@@ -322,93 +278,6 @@ def test_time_offset_of_foreign_or_periodic_streams_is_refused():
         with pytest.raises(HandEyeRefused) as caught:
             coarse_offset(hand, second)
         assert caught.value.cause == Cause.TIME_OFFSET
-
-
-def args(*words):
-    parser = argparse.ArgumentParser()
-    calibrate_cli.COMMAND.configure(parser)
-    return parser.parse_args([str(w) for w in words])
-
-
-def test_command_reads_pairs_and_writes_json(tmp_path):
-    """calibrate hand-eye takes JSON pairs and CSV pairs alike, prints a table and writes the same numbers."""
-    from scipy.spatial.transform import Rotation
-
-    A, B, X = station(7)
-    (tmp_path / "pairs.json").write_text(
-        json.dumps([[a.tolist(), b.tolist()] for a, b in zip(A, B, strict=True)])
-    )
-    for name, T in (("hand.csv", A), ("target.csv", B)):
-        rows = np.c_[np.arange(len(T)), T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()]
-        np.savetxt(
-            tmp_path / name, rows, delimiter=",", header="t,x,y,z,qx,qy,qz,qw", fmt="%.12f", comments=""
-        )
-    out = tmp_path / "result.json"
-    one = calibrate_cli.COMMAND.run(args("hand-eye", tmp_path / "pairs.json", "--out", out))
-    two = calibrate_cli.COMMAND.run(args("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv"))
-    written = json.loads(out.read_text())
-    np.testing.assert_allclose(written["T_flange_camera"], two.data["T_flange_camera"], atol=1e-8)
-    assert apart(np.array(written["T_flange_camera"]), X)[1] < 0.002
-    assert "standard error" in one.text
-    assert written["leave_one_out"] is not None
-    inverted = tmp_path / "inverted.json"
-    inverted.write_text(json.dumps([[a.tolist(), invert(b).tolist()] for a, b in zip(A, B, strict=True)]))
-    same = calibrate_cli.COMMAND.run(args("hand-eye", inverted, "--inverted-target"))
-    np.testing.assert_allclose(same.data["T_flange_camera"], written["T_flange_camera"], atol=1e-6)
-
-
-def test_command_finds_the_offset_of_streams(tmp_path):
-    """Two CSV streams with clocks apart are brought together and solved in one call."""
-    from scipy.spatial.transform import Rotation
-
-    hand, target, X = streams(0.25)
-    for name, stream in (("hand.csv", hand), ("target.csv", target)):
-        T = stream.poses
-        np.savetxt(
-            tmp_path / name,
-            np.c_[stream.seconds, T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()],
-            fmt="%.9f",
-        )
-    data = calibrate_cli.COMMAND.run(args("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv")).data
-    assert abs(data["time_offset_s"] - 0.25) < 0.002
-    assert apart(np.array(data["T_flange_camera"]), X)[1] < 0.002
-
-
-@pytest.mark.parametrize(
-    ("text", "kind"),
-    [
-        ("", FormatError),
-        ("[]", DataError),
-        ("{}", FormatError),
-        ("[[1, 2]]", FormatError),
-        ("[[[[1]], [[2]]]]", FormatError),
-    ],
-)
-def test_bad_pair_files_are_named(tmp_path, text, kind):
-    """Files that hold no pairs say so with their path."""
-    path = tmp_path / "pairs.json"
-    path.write_text(text)
-    with pytest.raises(kind, match=r"pairs\.json"):
-        read_pairs(path)
-    with pytest.raises(DataError, match="no such file"):
-        read_pairs(tmp_path / "none.json")
-
-
-@pytest.mark.parametrize(
-    "text", ["", "t,x\n", "0,1,2,3,0,0,0,1\n0,1,2\n", "0,1,2,3,1,1,0,1\n", "0,nan,2,3,0,0,0,1\n"]
-)
-def test_bad_csv_files_are_named(tmp_path, text):
-    """Streams with missing columns, NaN or quaternions that are none say so with their path."""
-    path = tmp_path / "hand.csv"
-    path.write_text(text)
-    with pytest.raises(DataError, match=r"hand\.csv"):
-        read_csv(path)
-
-
-def test_command_refuses_three_files():
-    """More than two files are a usage error."""
-    with pytest.raises(UsageError):
-        calibrate_cli.COMMAND.run(args("hand-eye", "a.csv", "b.csv", "c.csv"))
 
 
 def test_result_is_json(tmp_path):
