@@ -22,6 +22,7 @@ WIDTH = "96"  # columns of help texts
 _HEAVY = (
     "open3d", "kiss_icp", "cv2", "scipy", "torch", "numba", "matplotlib", "rich", "tomli_w", "jinja2", "safetensors", "small_gicp",
     "aiohttp", "distributed", "serial", "nxlib", "rerun", "tensorboard", "threadpoolctl", "rtde_control", "rtde_receive", "ArducamDepthCamera",
+    "triton",
 )  # fmt: skip
 ABSENT = [name for name in _HEAVY if importlib.util.find_spec(name) is None]
 
