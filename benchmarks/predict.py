@@ -2,9 +2,9 @@
 
     python benchmarks/predict.py [--preset NAME | --weights RUN] [--repeats 20] [--batch 8] [--device cuda]
 
-240 x 180 raw to 480 x 360 depth, normals and uncertainty, after loading, by the bundled network, a run's or an untrained preset's. Wall and CPU time, medians, backends in turns. Throughput
-comes with its share of peak: operations of convolutions and matrix products per second, over those of one large matrix product in
-the same precision, run beside it.
+240 x 180 raw to 480 x 360 depth, normals and uncertainty, after loading, by the bundled network, a run's or an untrained preset's. Wall
+and CPU time, medians, backends in turns. Throughput comes with its share of peak: operations of convolutions and matrix products
+per second, over those of one large matrix product in the same precision, run beside it.
 """
 
 from __future__ import annotations
@@ -61,27 +61,27 @@ def seconds(call, device: str, repeats: int) -> float:
 
 
 def throughput(model: JointModel, frame: Frame, batch: int, device: str, repeats: int) -> str:
-    """Frames per second of a batch that lies on the device, cues included, and its share of peak."""
+    """Frames per second through the network, of a batch that lies on the device with its cues, and the share of peak."""
     kind = torch.device(device).type
     model = model.to(device)
     many = frame_to(Frame(*(x.expand(batch, *x.shape[1:]).contiguous() for x in frame)), torch.device(device))
-    answer = in_half if has_bfloat16(kind) else JointModel.__call__
+    half = has_bfloat16(kind)
+
+    def ask(frame: Frame) -> tuple:
+        return (in_half(model, frame) if half else model(frame))[:3]
+
     with FlopCounterMode(display=False) as counter:
-        answer(model, many)
-    call = (lambda: answer(model, many)) if kind == "cpu" else None
-    if call is None:
-        launch = recorded(lambda f: answer(model, f)[:3], many)
-        call = lambda: launch(many)  # noqa: E731
-    taken = seconds(call, device, repeats)
-    side = 2048 if kind == "cpu" else 8192
-    kind_of = torch.bfloat16 if has_bfloat16(kind) else torch.float32
-    a, b = torch.randn(2, side, side, device=device).to(kind_of)
+        ask(many)
+    launch = ask if kind == "cpu" else recorded(ask, many)
+    taken = seconds(lambda: launch(many), device, repeats)
+    side, precision = 2048 if kind == "cpu" else 8192, torch.bfloat16 if half else torch.float32
+    a, b = torch.randn(2, side, side, device=device).to(precision)
     peak = 2 * side**3 / seconds(lambda: a @ b, device, repeats)
     operations = counter.get_total_flops()
     return (
         f"batch of {batch}: {batch / taken:.1f} frames/s, {operations / batch / 1e9:.1f} GFLOP each, "
         f"{operations / taken / 1e12:.2f} of {peak / 1e12:.2f} TFLOP/s that a matrix product of {side} reaches: "
-        f"{operations / taken / peak:.1%} of peak ({kind_of})"
+        f"{operations / taken / peak:.1%} of peak ({precision})"
     )
 
 

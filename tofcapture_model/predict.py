@@ -83,9 +83,9 @@ def predict_raw(
     taken = slice(None) if frame is None else slice(frame, frame + 1)
     raw, celsius = data.raw[taken].mean(axis=0, dtype=np.float64), float(data.celsius[taken].mean())
     ask = _onnx_model(weights, data.camera) if backend == "onnx" else _torch_model(weights, device)
-    decoder, place = frame_decoder(data.info, data.camera), torch.device(device)
-    parts = (raw, data.info, data.camera, celsius, decoder)
-    on_gpu = place.type == "cuda" and backend == "torch"
+    parts = (raw, data.info, data.camera, celsius, frame_decoder(data.info, data.camera))
+    place = torch.device("cpu" if backend == "onnx" else device)
+    on_gpu = place.type == "cuda"
     wait: Callable[[], None] = torch.cuda.synchronize if on_gpu else lambda: None
     with torch.inference_mode():
         if on_gpu:
@@ -94,7 +94,7 @@ def predict_raw(
             launch = recorded(lambda frame: ask(with_cues(frame, hz)), inputs)
         else:
             decoded, decode_ms = _timed(lambda: make_frame(*parts), wait)
-            inputs, launch = batched(decoded), ask
+            inputs, launch = frame_to(batched(decoded), place), ask
         (depth, normals, error), inference_ms = _timed(lambda: launch(inputs), wait)
     return Prediction(
         depth=depth[0, 0].cpu().numpy(),
@@ -123,7 +123,7 @@ Ask = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
 def recorded(ask: Ask, like: Frame) -> Ask:
     """Record what a GPU does for a frame as a CUDA graph, so that every further one takes a single launch.
 
-    A prediction is more than a thousand small kernels; launching them one by one takes longer than running them.
+    A prediction is about a thousand small kernels; launching them one by one takes longer than running them.
 
     Parameters
     ----------

@@ -23,21 +23,7 @@ def usable(device: torch.device) -> bool:
 
 @torch.no_grad()
 def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> list[Found]:
-    """Find the nearest neighbours of every p + s in Q and of every q in P + s, exactly.
-
-    Parameters
-    ----------
-    p, q
-        (3, H, W) points, metres, on the GPU; finite where masked.
-    p_mask, q_mask
-        (H, W) bool: which pixels belong to the clouds; neither is empty.
-    shifts
-        (S, 3) metres.
-
-    Returns
-    -------
-    One Found per shift
-    """
+    """Find the nearest neighbours of every p + s in Q and of every q in P + s, exactly: :func:`tofcapture_model.trees.nearest` on a GPU."""
     return _Clouds(p, q, p_mask, q_mask).found(shifts)
 
 
