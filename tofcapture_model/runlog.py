@@ -35,6 +35,11 @@ class Position:
     elapsed: float = 0.0
     before: float = 0.0
 
+    def next_stage(self) -> None:
+        """Go to the start of the next stage."""
+        self.stage, self.epoch, self.batch = self.stage + 1, 0, 0
+        self.before, self.elapsed = self.before + self.elapsed, 0.0
+
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
     """Rows of a ``metrics.jsonl`` by step; a line that a kill cut short is skipped, of two for a step the later counts."""

@@ -1,0 +1,145 @@
+"""What learns in one stage of a training, and how it takes a step."""
+
+from __future__ import annotations
+
+import math
+import os
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from tofcapture_model.augment import redraw_calibration, redraw_frame
+from tofcapture_model.config import Config, Stage
+from tofcapture_model.frame import Estimate, Frame, Target, frame_to, target_to
+from tofcapture_model.losses import Objective
+from tofcapture_model.runlog import Position
+from tofcapture_model.zoo import Model, compiled, select_stage, training_loss
+
+WARM_UP = 0.02  # of a stage, with a cosine schedule
+MAX_NORM = 1.0  # of the gradient
+
+
+class Group(NamedTuple):
+    """Which of the processes that train together this is, and the device that it has.
+
+    Attributes
+    ----------
+    rank, world
+        Of ``torchrun``; 0 and 1 for a single process.
+    place
+        Its device.
+    """
+
+    rank: int
+    world: int
+    place: torch.device
+
+    def slowest(self, seconds: float) -> float:
+        """Most seconds of all processes, so that all of them stop at the same step."""
+        if self.world == 1:
+            return seconds
+        most = torch.tensor(seconds, device=self.place, dtype=torch.float32)
+        torch.distributed.all_reduce(most, torch.distributed.ReduceOp.MAX)
+        return float(most)
+
+
+@contextmanager
+def processes(device: str) -> Iterator[Group]:
+    """Join the group that ``torchrun`` announces in the environment; with CUDA each process takes its own device."""
+    world, cuda = int(os.environ.get("WORLD_SIZE", "1")), torch.cuda.is_available()
+    if world == 1:
+        yield Group(0, 1, torch.device(device))
+        return
+    place = torch.device(f"cuda:{os.environ['LOCAL_RANK']}" if cuda else device)
+    torch.distributed.init_process_group("nccl" if cuda else "gloo")
+    try:
+        yield Group(torch.distributed.get_rank(), world, place)
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+class Learner:
+    """The part of a model that learns in a stage, with its optimiser.
+
+    Parameters
+    ----------
+    model, config, stage
+        What is trained, and how.
+    group
+        The processes that train together.
+    moments
+        Adam's, by the parameter's name, of a run that goes on; empty at the start of a stage.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        config: Config,
+        stage: Stage,
+        group: Group,
+        moments: Mapping[str, dict[str, Tensor]],
+    ) -> None:
+        self.model, self.config, self.stage, self.group = model, config, stage, group
+        self.parameters = select_stage(model, stage.name)
+        self.names = {id(p): n for n, p in model.named_parameters()}
+        self.optimizer = torch.optim.Adam(self.parameters, lr=stage.learning_rate)
+        self._restore(moments)
+        whole = nn.parallel.DistributedDataParallel(model) if group.world > 1 else model
+        self._answer = compiled(whole, group.place) if config.training.compile else whole
+
+    def _restore(self, moments: Mapping[str, dict[str, Tensor]]) -> None:
+        for parameter in self.parameters:
+            saved = moments.get(self.names[id(parameter)])
+            if saved:
+                self.optimizer.state[parameter] = {
+                    k: v if k == "step" else torch.empty_like(parameter).copy_(v) for k, v in saved.items()
+                }
+
+    def loss(self, frame: Frame, target: Target, averaged: int, position: Position) -> Objective:
+        """Answer a batch and hold it against the truth.
+
+        Parameters
+        ----------
+        frame, target
+            On any device.
+        averaged
+            Frames whose mean each item is; their noise is drawn again then. 0: items are single frames and stay as they are.
+        position
+            Seeds what is drawn: a resumed run draws what an unbroken one would have.
+        """
+        training, place = self.config.training, self.group.place
+        frame, target = frame_to(frame, place), target_to(target, place)
+        drawn = self._generator(position)
+        if averaged:
+            frame = redraw_frame(frame, drawn, averaged=averaged)
+        if training.phase_error:
+            frame = redraw_calibration(frame, drawn, training.phase_error)
+        with torch.autocast(place.type, torch.bfloat16, enabled=training.precision == "bfloat16"):
+            estimate = self._answer(frame, self.stage.name)
+        estimate = Estimate(*(x.float() for x in estimate))
+        return training_loss(self.model, self.config.losses, self.stage.name, estimate, target, frame)
+
+    def _generator(self, position: Position) -> torch.Generator:
+        seed = f"{self.config.training.seed}/{position.stage}/{position.step}/{self.group.rank}"
+        return torch.Generator(self.group.place).manual_seed(zlib.crc32(seed.encode()))
+
+    def step(self, loss: Objective, rate: float) -> None:
+        """Follow the gradient of a loss, clipped."""
+        for parameters in self.optimizer.param_groups:
+            parameters["lr"] = rate
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.total.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.parameters, MAX_NORM)
+        self.optimizer.step()
+
+
+def scheduled_rate(stage: Stage, schedule: str, progress: float) -> float:
+    """Learning rate at a fraction of a stage: constant, or a cosine to zero after a short warm-up."""
+    if schedule != "cosine":
+        return stage.learning_rate
+    cosine = max(0.5 * (1 + math.cos(math.pi * progress)), 1e-3)
+    return stage.learning_rate * min(1.0, 0.1 + progress / WARM_UP) * cosine
