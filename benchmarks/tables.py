@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from tofcapture_model.config import Config, Training, preset
+from tofcapture_model.config import BASELINES, OURS, Config, Training, preset
 from tofcapture_model.progress import Report, progress
 
 
@@ -59,9 +59,8 @@ def on_equal_terms(recipe: Config, args: argparse.Namespace, seed: int) -> Confi
     if args.crop:
         fair = replace(fair, crop=(args.crop, args.crop), batch=2)
     network = replace(recipe.network, width=args.width, levels=3) if args.width else recipe.network
-    stages = recipe.stages
-    if args.rate and network.kind == "paper":
-        stages = tuple(replace(stage, learning_rate=args.rate) for stage in stages)
+    rate = args.rate.get(network.kind)
+    stages = tuple(replace(stage, learning_rate=rate or stage.learning_rate) for stage in recipe.stages)
     return replace(recipe, network=network, training=fair, stages=stages)
 
 
@@ -84,13 +83,17 @@ def _arguments() -> argparse.Namespace:
     add("--crop", type=int, default=0, help="square, in batches of two")
     add(
         "--rate",
-        type=float,
-        default=0,
-        help="of the paper's networks instead of 1e-4, for budgets far below its epochs",
+        nargs="+",
+        default=[],
+        metavar="KIND=RATE",
+        help="learning rates instead of the presets', for budgets far below the published epochs",
     )
     add("--precision", choices=("float32", "bfloat16"), default="float32", help="of the training")
     add("--threads", type=int, default=0, help="of the CPU (default: as many as PyTorch takes)")
     args = parser.parse_args()
+    args.rate = {kind: float(rate) for kind, _, rate in (pair.partition("=") for pair in args.rate)}
+    if not set(args.rate) <= set(OURS + BASELINES):
+        parser.error(f"--rate: expected some of {', '.join(OURS + BASELINES)}, got {', '.join(args.rate)}")
     if args.add and "main" not in args.suite:
         parser.error("--add makes rows of the table main, which --suite leaves out")
     return args
