@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -311,6 +312,27 @@ def test_two_processes_train_together(dataset, tmp_path):
     assert [r.returncode for r in ranks] == [0, 0]
     assert {s.split()[-1] for s in said} == {"3"}
     assert (tmp_path / "run" / "model.safetensors").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="no C++ compiler")
+def test_compiled_u_nets_train_to_the_same_weights(dataset, tiny, tmp_path):
+    """Names and, but for rounding, values of the weights are those of a run without; whole frames are validated eagerly."""
+    for compile_ in (False, True):
+        training = replace(tiny.training, compile=compile_, validate_every=1)
+        config = replace(tiny, training=training, stages=(Stage("joint", 1, 1e-3),))
+        train(config, dataset, tmp_path / str(compile_))
+    plain, compiled = (load_model(tmp_path / name)[0].state_dict() for name in ("False", "True"))
+    assert plain.keys() == compiled.keys()
+    assert all(torch.allclose(plain[k], compiled[k], rtol=1e-3, atol=1e-4) for k in plain)
+
+
+def test_a_network_without_u_nets_is_not_compiled(dataset, tmp_path):
+    """Nothing would be compiled, and nobody would notice."""
+    config = preset("coarse-fine")
+    config = replace(config, training=replace(config.training, compile=True))
+    with pytest.raises(ConfigError, match="U-Nets"):
+        train(config, dataset, tmp_path / "run", epochs=1)
 
 
 def test_a_run_that_goes_on_knows_how_long_the_rest_takes(monkeypatch, capsys):

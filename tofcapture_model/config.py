@@ -180,7 +180,7 @@ class Training:
     precision
         ``float32``, or ``bfloat16`` for the convolutions; geometry and losses stay in float32. For GPUs with tensor cores.
     compile
-        Compile the model (``torch.compile``): minutes at the start, and faster steps after.
+        Compile the U-Nets (``torch.compile``): a minute or so at the start, and somewhat faster steps after.
     seed
         Of weights, order and crops.
     """

@@ -17,7 +17,7 @@ from tofcapture_model.config import Config, Stage
 from tofcapture_model.frame import Estimate, Frame, Target, frame_to, target_to
 from tofcapture_model.losses import Objective
 from tofcapture_model.runlog import Position
-from tofcapture_model.zoo import Model, compiled, select_stage, training_loss
+from tofcapture_model.zoo import Model, select_stage, training_loss
 
 WARM_UP = 0.02  # of a stage, with a cosine schedule
 MAX_NORM = 1.0  # of the gradient
@@ -88,8 +88,7 @@ class Learner:
         self.names = {id(p): n for n, p in model.named_parameters()}
         self.optimizer = torch.optim.Adam(self.parameters, lr=stage.learning_rate)
         self._restore(moments)
-        whole = nn.parallel.DistributedDataParallel(model) if group.world > 1 else model
-        self._answer = compiled(whole, group.place) if config.training.compile else whole
+        self._answer = nn.parallel.DistributedDataParallel(model) if group.world > 1 else model
 
     def _restore(self, moments: Mapping[str, dict[str, Tensor]]) -> None:
         for parameter in self.parameters:

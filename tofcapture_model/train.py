@@ -6,7 +6,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from tofcapture_model.learner import Group, Learner, processes, scheduled_rate
 from tofcapture_model.losses import Objective
 from tofcapture_model.run_card import write_card
 from tofcapture_model.runlog import Log, Position
-from tofcapture_model.zoo import Model, build_model
+from tofcapture_model.zoo import Model, build_model, compile_unets
 
 SAVE_EVERY = 60.0  # s between resume points
 LOG_EVERY = 20  # steps
@@ -158,6 +158,8 @@ def train(
         run = _open_run(config, model, group, out, source, minutes)
         if run.position.stage == len(config.stages):
             return run.ended(finished=True)
+        if config.training.compile:
+            compile_unets(model, group.place)
         data = _training_data(config.training, datasets, cache, workers)
         with closing(data), closing(Log(out if group.rank == 0 else None)) as log:
             for stage in config.stages[run.position.stage :]:
@@ -244,7 +246,8 @@ def _finish(run: _Run, dataset: Path, source: Mapping[str, Any]) -> None:
         "losses": run.losses,
     }
     if isinstance(run.model, JointModel) and run.config.losses.uncertainty == "laplace":
-        provenance["uncertainty"] = calibrate(run.model, dataset, place)
+        with _eagerly():
+            provenance["uncertainty"] = calibrate(run.model, dataset, place)
     provenance |= write_card(run.out, run.config, run.model, dataset, place, provenance, run.minutes)
     save_model(run.out / "model.safetensors", run.model, run.config, provenance)
 
@@ -317,13 +320,19 @@ def _progress(position: Position, stage: Stage, batches: int, budget: float | No
     return (position.epoch + position.batch / batches) / stage.epochs
 
 
+def _eagerly() -> AbstractContextManager[object]:
+    """Answer whole frames without compiled U-Nets, which would be compiled for that size anew."""
+    return torch.compiler.set_stance("force_eager")  # type: ignore[no-any-return]
+
+
 def _validate(model: Model, dataset: Path, place: torch.device) -> dict[str, float]:
     """MAE (m) and mean angle (deg) on the first frames of the ``val`` split; empty where there is no such split."""
     if not load_manifest(dataset).split("val"):
         return {}
     data = FrameDataset(dataset, "val", frames=1)
     model.eval()
-    table = score({"model": model_method(model)}, data, place)[0]["model"].table()
+    with _eagerly():
+        table = score({"model": model_method(model)}, data, place)[0]["model"].table()
     model.train()
     data.close()
     if not table["depth"]["pixel"]["pixels"]:

@@ -18,6 +18,7 @@ from tofcapture_model.frame import Estimate, Frame, Target
 from tofcapture_model.geometry import scale_intrinsics
 from tofcapture_model.joint import JointModel
 from tofcapture_model.losses import Objective, objective
+from tofcapture_model.unet import UNet
 
 Model = JointModel | Baseline
 
@@ -44,13 +45,16 @@ def build_model(config: Config) -> Model:
     return model.to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 
-def compiled(model: nn.Module, device: torch.device) -> nn.Module:
-    """Compile a model (``training.compile``).
+def compile_unets(model: Model, device: torch.device) -> None:
+    """Compile the U-Nets of a model in place (``training.compile``); names and values of its weights stay.
+
+    Convolutions are nearly all of a step, and compiling them takes a minute; plane fits and losses around them take many more
+    and give little.
 
     Raises
     ------
     ConfigError
-        PyTorch would find no C++ compiler for a CPU.
+        The model has no U-Net, or PyTorch would find no C++ compiler for a CPU.
     """
     compiler = os.environ.get("CXX", "g++")
     if device.type == "cpu" and shutil.which(compiler) is None:
@@ -58,7 +62,14 @@ def compiled(model: nn.Module, device: torch.device) -> nn.Module:
             f"training.compile: expected the C++ compiler {compiler}, found none",
             hint="install g++, name one in CXX, or leave compile = false",
         )
-    return torch.compile(model)  # type: ignore[return-value]
+    nets = [module for module in model.modules() if isinstance(module, UNet)]
+    if not nets:
+        raise ConfigError(
+            f"training.compile: expected a network of U-Nets (paper, compact), got {type(model).__name__}",
+            hint="leave compile = false",
+        )
+    for net in nets:
+        net.compile()
 
 
 def select_stage(model: Model, stage: str) -> list[nn.Parameter]:
