@@ -139,8 +139,10 @@ def shoot(shapes, camera, index, seed, frames):
     )
 
 
-def make_dataset(folder, *, views=3, frames=2, scale=1, splits=("train", "train", "test"), seed=0):
-    """Write a dataset of analytic scenes; ``scale`` divides the sensor's resolution."""
+def make_dataset(
+    folder, *, views=3, frames=2, scale=1, splits=("train", "train", "test"), seed=0, objects=()
+):
+    """Write a dataset of analytic scenes; ``scale`` divides the sensor's resolution, ``objects`` are the scenes' as shards tell them."""
     camera = Camera(240 // scale, 180 // scale, 190.6 / scale, 200.8 / scale, 116.8 / scale, 101.5 / scale)
     info = TofInfo("analytic", "0", camera, np.zeros(3))
     stereo = StereoInfo("none", "0", Camera(10, 8, 10, 10, 4.5, 3.5))
@@ -154,6 +156,7 @@ def make_dataset(folder, *, views=3, frames=2, scale=1, splits=("train", "train"
             shapes = scene_shapes(seed + i)
             for view in range(views):
                 shard.add(shoot(shapes, camera, view, seed + i, frames))
-            scenes[name] = SceneEntry(path, shard.seal({}), views, split)
+            told = {"objects": list(objects[i])} if objects else {}
+            scenes[name] = SceneEntry(path, shard.seal(told), views, split)
     write_manifest(folder, Manifest(scenes))
     return folder

@@ -98,6 +98,7 @@ def test_fine_tuning_starts_from_weights(dataset, tiny, trained, tmp_path):
     assert first[1] < first[0]
     provenance = load_model(tmp_path / "on")[2]
     assert provenance["start_sha256"] == sha256_of(trained[1].path)
+    assert provenance["learned"]["objects"] == ["scene"]
     other = replace(tiny, network=replace(tiny.network, width=5))
     with pytest.raises(ConfigError, match="expected weights of the configuration's network"):
         train(other, dataset, tmp_path / "other", start=trained[1].path)
@@ -180,6 +181,9 @@ def test_evaluation_writes_the_agreed_results(dataset, trained, tmp_path):
     """Both methods, both quantities, both poolings, in metres, on the test split."""
     results = evaluate(dataset, trained[0], tmp_path / "results.json", frames=0)
     assert json.loads((tmp_path / "results.json").read_text()) == results
+    assert results["not_new"] == {
+        "scene-2": "object scene"
+    }  # scene-0, -1 and -2 are one object by their names
     assert (results["format"], results["version"], results["split"]) == ("tofcapture-results", 1, "test")
     assert (results["views"], results["frames"], results["scenes"]) == (3, 6, ["scene-2"])
     for method in ("sensor", "model"):

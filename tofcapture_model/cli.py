@@ -191,7 +191,7 @@ def _evaluate(args: argparse.Namespace) -> Outcome:
 
 
 def _suite(args: argparse.Namespace) -> Outcome:
-    from tofcapture_model.suite import read_weights, run_suite
+    from tofcapture_model.suite import read_weights, run_suite, seen_before
     from tofcapture_model.tables import markdown
 
     with progress() as report:
@@ -207,7 +207,8 @@ def _suite(args: argparse.Namespace) -> Outcome:
             progress=lambda done, total: report("evaluate", done / total),
         )
     names = list(SUITES) if args.suite == "all" else [args.suite]
-    return Outcome({**results, "results": str(args.out)}, f"{markdown(results, names)}\n{args.out}")
+    text = f"{markdown(results, names)}\n{seen_before(results)}{args.out}"
+    return Outcome({**results, "results": str(args.out)}, text)
 
 
 def _configure_predict(parser: argparse.ArgumentParser) -> None:

@@ -18,6 +18,7 @@ from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.data import FrameDataset, batched
 from tofcapture_model.frame import Frame, frame_to, target_to
 from tofcapture_model.joint import JointModel
+from tofcapture_model.learned import not_new, sentence
 from tofcapture_model.metrics import Score
 from tofcapture_model.shards import SampleId
 from tofcapture_model.zoo import Model
@@ -162,7 +163,8 @@ def evaluate(
         "units": "m",
         "weights": str(find_model(weights)),
         "network": config.network.kind,
-        "training": provenance,
+        "training": {k: v for k, v in provenance.items() if k != "learned"},
+        "not_new": not_new(provenance, dataset, split),
         "methods": {name: s.table() for name, s in scores.items()},
     }
     data.close()
@@ -195,4 +197,5 @@ def comparison(results: dict[str, Any]) -> str:
             f"{name:8} {1000 * d['mae']:8.2f} {1000 * d['median']:8.2f} {1000 * d['rmse']:8.2f} {100 * d['abs']:7.2f}"
             f" {n['mean_deg']:11.2f} {n['paper_bad20_pct']:10.2f} {100 * d['coverage']:8.1f}%"
         )
-    return "\n".join(rows)
+    said = sentence("model", results["not_new"], len(results["scenes"])) if "not_new" in results else ""
+    return "\n".join([*rows, said] if said else rows)

@@ -21,6 +21,7 @@ from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.data import FrameDataset, batched, spare_memory
 from tofcapture_model.evaluate import write_results
 from tofcapture_model.frame import Frame, Target, frame_to, target_to
+from tofcapture_model.learned import not_new, sentence
 from tofcapture_model.measures import Precision, Uncertainty, regions
 from tofcapture_model.metrics import Score
 from tofcapture_model.run_card import budget
@@ -234,7 +235,11 @@ def measure_runs(
     by_name: dict[str, list[dict[str, Any]]] = {}
     for nth, (name, i, path) in enumerate(runs, 1):
         model, _, provenance = load_model(path)
-        trained[f"{name}#{i}"] = {"weights": str(path), "training": provenance}
+        trained[f"{name}#{i}"] = {
+            "weights": str(path),
+            "training": {k: v for k, v in provenance.items() if k != "learned"},
+            "not_new": not_new(provenance, dataset, split),
+        }
         row = measure(data, {name: _learned(model.to(place))}, place, part(nth))[name]
         by_name.setdefault(name, []).append({**row, "budget": budget(provenance)})
     data.close()
@@ -252,6 +257,12 @@ def measure_runs(
         "methods": {name: mean for name, (mean, _) in table.items()},
         "spread": {name: spread for name, (_, spread) in table.items() if len(weights.get(name, ())) > 1},
     }
+
+
+def seen_before(results: Mapping[str, Any]) -> str:
+    """A line for every run that has learned from some of the scenes, or does not tell."""
+    said = [sentence(name, run["not_new"], len(results["scenes"])) for name, run in results["runs"].items()]
+    return "".join(f"{line}\n" for line in said if line)
 
 
 def write_suite(

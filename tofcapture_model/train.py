@@ -30,6 +30,7 @@ from tofcapture_model.config import Config, Stage, Training, dumps_config
 from tofcapture_model.data import FrameDataset, collate, epoch_batches, spare_memory
 from tofcapture_model.evaluate import calibrate, model_method, score
 from tofcapture_model.joint import JointModel
+from tofcapture_model.learned import learned_from
 from tofcapture_model.learner import Group, Learner, processes, scheduled_rate
 from tofcapture_model.losses import Objective
 from tofcapture_model.run_card import write_card
@@ -154,7 +155,7 @@ def train(
     with processes(device) as group:
         torch.manual_seed(config.training.seed)
         model = build_model(config).to(group.place)
-        source = _source(datasets) | (_begin_with(model, config, start) if start else {})
+        source = _source(datasets, _begin_with(model, config, start) if start else None)
         run = _open_run(config, model, group, out, source, minutes)
         if run.position.stage == len(config.stages):
             return run.ended(finished=True)
@@ -263,22 +264,27 @@ def _expect_finite(loss: Objective, position: Position, out: Path) -> None:
 
 
 def _begin_with(model: Model, config: Config, start: Path) -> dict[str, Any]:
-    """Give the model the weights of a checkpoint; returns where they are from."""
-    other, its, _ = load_model(start)
+    """Give the model the weights of a checkpoint; returns where they are from, and what they have learned from."""
+    other, its, provenance = load_model(start)
     if its.network != config.network:
         raise ConfigError(
             f"{start}: expected weights of the configuration's network ({config.network.kind}), got {its.network.kind} with other sizes or kind",
             hint=f"--config {find_model(start).with_suffix('.toml')} has its configuration",
         )
     load_strictly(model, other.state_dict(), start)
-    return {"start": str(start), "start_sha256": sha256_of(find_model(start))}
+    begun = {"start": str(start), "start_sha256": sha256_of(find_model(start))}
+    return begun | ({"learned": provenance["learned"]} if "learned" in provenance else {})
 
 
-def _source(datasets: Sequence[Path]) -> dict[str, Any]:
-    """Name the datasets by their folders and the digests of their manifests."""
+def _source(datasets: Sequence[Path], begun: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Name the datasets by their folders and the digests of their manifests, and all that is learned from, as far as it is known."""
     first, *also = datasets
-    source: dict[str, Any] = {"dataset": str(first), "manifest_sha256": _digest(first)}
-    return source | ({"also": {str(d): _digest(d) for d in also}} if also else {})
+    source: dict[str, Any] = {"dataset": str(first), "manifest_sha256": _digest(first), **(begun or {})}
+    if also:
+        source["also"] = {str(d): _digest(d) for d in also}
+    if begun is None or "learned" in begun:
+        source["learned"] = learned_from(datasets, source.get("learned"))
+    return source
 
 
 def _digest(dataset: Path) -> str:
