@@ -193,6 +193,19 @@ def test_evaluation_writes_the_agreed_results(dataset, trained, tmp_path):
         assert 0 < table["normal"]["pixel"]["mean_deg"] < 90
 
 
+def test_a_report_knows_the_weights_of_a_table_and_what_they_learned_from(dataset, trained, tmp_path):
+    """The checkpoint that was evaluated is no other one; a test scene with a training scene's object is told."""
+    report = pytest.importorskip("tofcapture_model.report", exc_type=ImportError)
+    pytest.importorskip("jinja2")
+    results = tmp_path / "results.json"
+    evaluate(dataset, trained[0], results)
+    page = report.write_report(
+        dataset=dataset, results=results, evidence=None, weights=trained[0], out=tmp_path / "o.html", views=1
+    ).read_text()
+    assert "other weights than the table" not in page
+    assert "1 of 1 scenes are not new to it: scene-2 (object scene)" in page
+
+
 def test_predict_writes_every_file_from_a_shard_and_from_an_array(dataset, trained, tmp_path):
     """A shard's frame gives depth, normals, error, PLY and PNG; the same taps as .npy need a rig of their size."""
     shard = dataset / "shards" / "scene-2.h5"

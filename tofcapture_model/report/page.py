@@ -14,6 +14,7 @@ from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.layout import SPLITS
 from tofcapture.files.manifest import Manifest, load_manifest, manifest_path
 from tofcapture.files.seal import sha256_of
+from tofcapture_model.learned import sentence
 from tofcapture_model.report.alignment import alignment
 from tofcapture_model.report.examples import choose, describe_shard, load_examples
 from tofcapture_model.report.panels import panels
@@ -209,7 +210,8 @@ def doubts(sources: Sources) -> list[str]:
     """What a reader must know before believing that the parts of the page belong together."""
     out = []
     results, network = sources.results, sources.network
-    if results and network and results.get("training") not in (None, dict(network.provenance)):
+    origin = {k: v for k, v in network.provenance.items() if k != "learned"} if network else None
+    if results and network and results.get("training") not in (None, origin):
         out.append("The pictures are made with other weights than the table.")
     trained_on = network.provenance.get("manifest_sha256") if network else None
     if trained_on and sources.manifest_sha256 and trained_on != sources.manifest_sha256:
@@ -222,6 +224,9 @@ def doubts(sources: Sources) -> list[str]:
         scenes = sorted(sources.manifest.split(str(results["split"])))
         if scenes != sorted(results["scenes"]):
             out.append("The table was measured on other scenes than this dataset's split holds.")
-    if results and results.get("split") == "train":
-        out.append("The table was measured on what the network was trained on.")
+    if results and results.get("not_new"):
+        said = sentence("the network", results["not_new"], len(results["scenes"]))
+        out.append(f"The table was measured on what the network was trained on: {said}.")
+    elif results and results.get("split") == "train" and results.get("not_new") is None:
+        out.append("The table may have been measured on what the network was trained on: the split train.")
     return out
