@@ -225,8 +225,7 @@ def doubts(sources: Sources) -> list[str]:
         if scenes != sorted(results["scenes"]):
             out.append("The table was measured on other scenes than this dataset's split holds.")
     if results and results.get("not_new"):
-        said = sentence("the network", results["not_new"], len(results["scenes"]))
-        out.append(f"The table was measured on what the network was trained on: {said}.")
+        out.append(sentence("The network", results["not_new"], len(results["scenes"])) + ".")
     elif results and results.get("split") == "train" and results.get("not_new") is None:
         out.append("The table may have been measured on what the network was trained on: the split train.")
     return out
