@@ -125,9 +125,12 @@ def test_recipes_are_the_rows_of_the_tables():
     for suite in ("ablation", "inputs"):
         assert {*recipes[suite], "sensor"} == SUITES[suite].rows.keys()
     assert recipes["main"].keys() - {"compact"} <= SUITES["main"].rows.keys()
-    args = argparse.Namespace(width=8, crop=0, rate=0.0, precision="bfloat16")
-    equal = {script.on_equal_terms(c, args, 1).training for suite in recipes.values() for c in suite.values()}
-    assert len(equal) == 1
+    args = argparse.Namespace(width=8, crop=0, rate={"paper": 5e-4}, precision="bfloat16")
+    equal = {n: script.on_equal_terms(c, args, 1) for suite in recipes.values() for n, c in suite.items()}
+    assert len({config.training for config in equal.values()}) == 1
+    rates = {name: {stage.learning_rate for stage in config.stages} for name, config in equal.items()}
+    assert rates["paper"] == rates["without-chamfer"] == {5e-4}
+    assert rates["coarse-fine"] == {1e-3}
 
 
 def test_a_card_tells_of_its_run(dataset, runs):
