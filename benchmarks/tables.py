@@ -64,6 +64,14 @@ def on_equal_terms(recipe: Config, args: argparse.Namespace, seed: int) -> Confi
     return replace(recipe, network=network, training=fair, stages=stages)
 
 
+def _rate(pair: str) -> tuple[str, float]:
+    """Read ``KIND=RATE``."""
+    kind, _, rate = pair.partition("=")
+    if kind not in OURS + BASELINES:
+        raise argparse.ArgumentTypeError(f"expected one of {', '.join(OURS + BASELINES)}, got {kind!r}")
+    return kind, float(rate)  # argparse says what is wrong with a rate that is no number
+
+
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -84,6 +92,7 @@ def _arguments() -> argparse.Namespace:
     add(
         "--rate",
         nargs="+",
+        type=_rate,
         default=[],
         metavar="KIND=RATE",
         help="learning rates instead of the presets', for budgets far below the published epochs",
@@ -91,9 +100,7 @@ def _arguments() -> argparse.Namespace:
     add("--precision", choices=("float32", "bfloat16"), default="float32", help="of the training")
     add("--threads", type=int, default=0, help="of the CPU (default: as many as PyTorch takes)")
     args = parser.parse_args()
-    args.rate = {kind: float(rate) for kind, _, rate in (pair.partition("=") for pair in args.rate)}
-    if not set(args.rate) <= set(OURS + BASELINES):
-        parser.error(f"--rate: expected some of {', '.join(OURS + BASELINES)}, got {', '.join(args.rate)}")
+    args.rate = dict(args.rate)
     if args.add and "main" not in args.suite:
         parser.error("--add makes rows of the table main, which --suite leaves out")
     return args

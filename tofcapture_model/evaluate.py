@@ -18,7 +18,7 @@ from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.data import FrameDataset, batched
 from tofcapture_model.frame import Frame, frame_to, target_to
 from tofcapture_model.joint import JointModel
-from tofcapture_model.learned import not_new, sentence
+from tofcapture_model.learned import not_new, origin, sentence
 from tofcapture_model.metrics import Score
 from tofcapture_model.shards import SampleId
 from tofcapture_model.zoo import Model
@@ -163,7 +163,7 @@ def evaluate(
         "units": "m",
         "weights": str(find_model(weights)),
         "network": config.network.kind,
-        "training": {k: v for k, v in provenance.items() if k != "learned"},
+        "training": origin(provenance),
         "not_new": not_new(provenance, dataset, split),
         "methods": {name: s.table() for name, s in scores.items()},
     }

@@ -82,6 +82,11 @@ def _objects(dataset: Path, name: str, entry: SceneEntry) -> set[str]:
     return {thing for thing in names if not _NUMBERED.match(thing)}
 
 
+def origin(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Provenance for results and pages: all but the long lists of what was learned from."""
+    return {key: value for key, value in provenance.items() if key != "learned"}
+
+
 def sentence(who: str, found: Mapping[str, str] | None, scenes: int) -> str:
     """Say it to people; nothing where all scenes are new."""
     if found is None:

@@ -21,7 +21,7 @@ from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.data import FrameDataset, batched, spare_memory
 from tofcapture_model.evaluate import write_results
 from tofcapture_model.frame import Frame, Target, frame_to, target_to
-from tofcapture_model.learned import not_new, sentence
+from tofcapture_model.learned import not_new, origin, sentence
 from tofcapture_model.measures import Precision, Uncertainty, regions
 from tofcapture_model.metrics import Score
 from tofcapture_model.run_card import budget
@@ -237,7 +237,7 @@ def measure_runs(
         model, _, provenance = load_model(path)
         trained[f"{name}#{i}"] = {
             "weights": str(path),
-            "training": {k: v for k, v in provenance.items() if k != "learned"},
+            "training": origin(provenance),
             "not_new": not_new(provenance, dataset, split),
         }
         row = measure(data, {name: _learned(model.to(place))}, place, part(nth))[name]

@@ -48,8 +48,7 @@ def build_model(config: Config) -> Model:
 def compile_unets(model: Model, device: torch.device) -> None:
     """Compile the U-Nets of a model in place (``training.compile``); names and values of its weights stay.
 
-    Convolutions are nearly all of a step, and compiling them takes a minute; plane fits and losses around them take many more
-    and give little.
+    What is around them, plane fits and losses, stays as it is: compiling a whole model was not done after 400 s (docs/network.md).
 
     Raises
     ------

@@ -14,7 +14,7 @@ from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.layout import SPLITS
 from tofcapture.files.manifest import Manifest, load_manifest, manifest_path
 from tofcapture.files.seal import sha256_of
-from tofcapture_model.learned import sentence
+from tofcapture_model.learned import origin, sentence
 from tofcapture_model.report.alignment import alignment
 from tofcapture_model.report.examples import choose, describe_shard, load_examples
 from tofcapture_model.report.panels import panels
@@ -210,8 +210,7 @@ def doubts(sources: Sources) -> list[str]:
     """What a reader must know before believing that the parts of the page belong together."""
     out = []
     results, network = sources.results, sources.network
-    origin = {k: v for k, v in network.provenance.items() if k != "learned"} if network else None
-    if results and network and results.get("training") not in (None, origin):
+    if results and network and results.get("training") not in (None, origin(network.provenance)):
         out.append("The pictures are made with other weights than the table.")
     trained_on = network.provenance.get("manifest_sha256") if network else None
     if trained_on and sources.manifest_sha256 and trained_on != sources.manifest_sha256:
