@@ -241,13 +241,10 @@ def test_the_same_inputs_give_the_same_bytes(sample, view):
 
 
 def test_a_rig_of_another_camera_is_refused(view):
-    """Sizes that disagree, and a stereo camera that looks elsewhere, are data errors."""
+    """Sizes that disagree are a data error."""
     wrong = replace(true_rig(view), tof=view.rig.tof.scaled(2))
     with pytest.raises(DataError, match="expected ToF images"):
         make_sample(view, wrong, CONFIG, rng())
-    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
-    with pytest.raises(DataError, match="measured nothing"):
-        make_sample(view, replace(true_rig(view), T_tof_stereo=turned), CONFIG, rng())
 
 
 def test_build_check_and_read(recording, tmp_path):
@@ -338,6 +335,41 @@ def test_a_damaged_view_fails_its_scene_only(recording, tmp_path):
     assert "view-002.h5" in result.failures["box"].message
     assert set(result.scenes) == {"mug", "gear"}
     assert check(tmp_path / "out") == []
+
+
+def blind(view):
+    """The view as a stereo camera without light would have given it."""
+    return replace(view, stereo=replace(view.stereo, points=np.full_like(view.stereo.points, np.nan)))
+
+
+def test_a_view_without_stereo_costs_no_scene(recording, tmp_path, capsys):
+    """It stays, fully masked, and is named; a scene of nothing else is a failure."""
+    copy = shutil.copytree(recording, tmp_path / "recording")
+    for scene, index in (("box", 2), ("gear", 1)):
+        path = view_path(copy, scene, index)
+        seen = read_view(path)
+        path.unlink()
+        write_view(path, blind(seen))
+    out = tmp_path / "out"
+    assert main(["build-dataset", str(copy), "--out", str(out), "--jobs", "1"]) == 5
+    said = capsys.readouterr().out
+    assert "no good ground truth in box: view-002.h5" in said
+    assert "FAILED gear: gear: stereo measured nothing" in said
+    with ShardReader(out / "shards/box.h5") as shard:
+        gt = shard.ground_truth(1, 2)
+    assert np.isnan(gt.depth).all()
+    assert (gt.mask & MaskBit.NOT_HIT).all()
+    assert check(out) == []
+
+
+def test_a_rig_that_looks_elsewhere_fails_all(recording, tmp_path):
+    """With the stereo camera turned about, no scene has ground truth."""
+    rig = true_rig(read_view(view_path(recording, "box", 0)))
+    path = tmp_path / "rig.toml"
+    path.write_text(dumps_rig(replace(rig, T_tof_stereo=np.diag([-1.0, 1.0, -1.0, 1.0]))))
+    result = build_dataset([recording], tmp_path / "out", path, jobs=1)
+    assert set(result.failures) == {"box", "mug", "gear"}
+    assert "any of 2 views" in result.failures["box"].message
 
 
 def test_what_cannot_be_built_is_refused(recording, tmp_path):

@@ -129,6 +129,7 @@ def _outcome(result: BuildResult, seconds: float, *, complete: bool) -> Outcome:
         "splits": {name: entry.split for name, entry in sorted(result.scenes.items())},
         "gt": None if result.gt is None else result.gt.table(),
         "failures": {scene: {"message": e.message, "hint": e.hint} for scene, e in result.failures.items()},
+        "bare": {scene: list(names) for scene, names in result.bare.items()},
         "missing": list(result.missing),
         "peak_memory_bytes": result.peak_memory,
         "seconds": round(seconds, 2),
@@ -153,6 +154,10 @@ def _text(result: BuildResult, views: int, seconds: float) -> str:
             f"ground truth against the simulator: median {gt.median_error_mm:.2f} mm, "
             f"99 % {gt.p99_error_mm:.2f} mm, covers {gt.coverage:.0%} of the object"
         )
+    lines += [
+        f"no good ground truth in {scene}: {', '.join(names)}; they stay in the shard, fully masked"
+        for scene, names in result.bare.items()
+    ]
     if result.missing:
         lines.append(
             f"{len(result.missing)} scenes are not there yet: {', '.join(result.missing[:5])}; no manifest is written"

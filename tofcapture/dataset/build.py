@@ -40,6 +40,8 @@ class BuildResult:
         Scenes whose shard was already right.
     failures
         Error by scene that has no shard.
+    bare
+        Names of the views, by scene, that have no pixel of good ground truth: nothing can be learned from them.
     missing
         Scenes that are other calls' to build and are not there yet; then there is no manifest either.
     gt
@@ -52,6 +54,7 @@ class BuildResult:
     scenes: Mapping[str, SceneEntry]
     skipped: tuple[str, ...]
     failures: Mapping[str, TofError]
+    bare: Mapping[str, tuple[str, ...]]
     missing: tuple[str, ...]
     gt: TruthError | None
     peak_memory: int
@@ -176,7 +179,8 @@ def _result(
     whole: bool,
 ) -> BuildResult:
     there = {t.scene: t.path for t in tasks if outcomes.get(t.scene, SceneOutcome(None)).sha256}
-    splits = assign_splits((t.scene for t in tasks), {scene: _objects(path) for scene, path in there.items()})
+    known = {scene: _provenance(path) for scene, path in there.items()}
+    splits = assign_splits((t.scene for t in tasks), {scene: _objects(p) for scene, p in known.items()})
     entries: dict[str, SceneEntry] = {}
     failures: dict[str, TofError] = {}
     for task in tasks:
@@ -193,13 +197,23 @@ def _result(
         gt = _finish(out, entries, config)
     skipped = tuple(scene for scene, o in sorted(outcomes.items()) if o.skipped)
     peak = max((o.peak_memory for o in outcomes.values()), default=0)
-    return BuildResult(out, entries, skipped, failures, missing, gt, peak)
+    bare = {scene: names for scene, p in known.items() if (names := _bare(p))}
+    return BuildResult(out, entries, skipped, failures, bare, missing, gt, peak)
 
 
-def _objects(shard: Path) -> list[str]:
-    """Objects that a shard says it shows; none when it does not know."""
+def _provenance(shard: Path) -> Mapping[str, Any]:
     with ShardReader(shard) as reader:
-        return [str(name) for name in reader.provenance.get("objects") or ()]
+        return reader.provenance
+
+
+def _objects(provenance: Mapping[str, Any]) -> list[str]:
+    """Objects that a shard says it shows; none when it does not know."""
+    return [str(name) for name in provenance.get("objects") or ()]
+
+
+def _bare(provenance: Mapping[str, Any]) -> tuple[str, ...]:
+    """Names of a shard's views without good ground truth."""
+    return tuple(v["name"] for v in provenance.get("views", ()) if v["good_pixels"] == 0)
 
 
 @contextmanager

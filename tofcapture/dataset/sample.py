@@ -97,7 +97,7 @@ def make_sample(
     Raises
     ------
     DataError
-        When the view and the rig are of different cameras, or stereo measured nothing in the ToF camera's view.
+        When the view and the rig are of different cameras.
     """
     check_cameras(view, rig)
     T_base_tof = view.arm_before.T_base_flange @ rig.T_flange_tof
@@ -114,11 +114,6 @@ def make_sample(
         camera = rig.tof.scaled(scale)
         projection = project(sheet, rig.stereo, rig.T_tof_stereo, camera, edge_pixels=scale, far=config.far)
         truths[scale] = assemble(smoothed(projection, field, rig, camera), rig, camera, crop)
-    if all((truth.mask & MaskBit.NOT_HIT).all() for truth in truths.values()):
-        raise DataError(
-            f"{view.scene} view {view.index}: stereo measured nothing in the ToF camera's view",
-            hint="check the rig",
-        )
     return Sample(
         index=view.index,
         raw=view.tof.raw,

@@ -28,9 +28,9 @@ from tofcapture import __version__
 from tofcapture.dataset.crew import Crew, one_thread
 from tofcapture.dataset.sample import SampleConfig, calibrated, make_sample
 from tofcapture.dataset.truth import TruthError, ViewError, pool, view_error
-from tofcapture.errors import TofError
+from tofcapture.errors import DataError, TofError
 from tofcapture.files.hdf import dumps
-from tofcapture.files.layout import SHARD
+from tofcapture.files.layout import SHARD, MaskBit
 from tofcapture.files.seal import digest_path, sealed_digest
 from tofcapture.files.shard import Sample, ShardReader
 from tofcapture.files.shard_writer import ShardWriter
@@ -200,21 +200,29 @@ def build_shard(
     Raises
     ------
     DataError
-        A view is damaged or is of another camera than the rig; nothing is left behind.
+        A view is damaged or is of another camera than the rig, or stereo measured nothing in the ToF camera's image in any view;
+        nothing is left behind.
     """
     first, depth = read_depth_view(task.views[0])
     info = calibrated(first.tof.info, task.rig)
     errors: list[ViewError] = []
     good: list[int] = []
+    seen = False
     with _work_folder(task.path) as work:
         made = work / task.path.name
         with ShardWriter(made, task.scene, task.rig, info, first.stereo.info, len(task.views)) as shard:
             for path, (sample, error) in zip(task.views, _samples(task, (first, depth), crew), strict=True):
                 shard.add(sample, path)
                 good.append(int((sample.ground_truth[2].mask == 0).sum()))
+                seen = seen or not (sample.ground_truth[2].mask & MaskBit.NOT_HIT).all()
                 errors += [] if error is None else [error]
                 if progress:
                     progress(len(good))
+            if not seen:
+                raise DataError(
+                    f"{task.scene}: stereo measured nothing in the ToF camera's image in any of {len(good)} views",
+                    hint="is it the rig of these cameras? tofcapture view shows both",
+                )
             digest = shard.seal(_provenance(task, inputs, first, good, pool(errors) if errors else None))
         digest_path(made).replace(digest_path(task.path))  # first: a shard always has its digest
         made.replace(task.path)
