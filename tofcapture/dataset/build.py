@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tofcapture.dataset.card import write_card
 from tofcapture.dataset.engines import Progress, run
@@ -213,7 +214,7 @@ def _objects(provenance: Mapping[str, Any]) -> list[str]:
 
 def _bare(provenance: Mapping[str, Any]) -> tuple[str, ...]:
     """Names of a shard's views without good ground truth."""
-    return tuple(v["name"] for v in provenance.get("views", ()) if v["good_pixels"] == 0)
+    return tuple(view["name"] for view in provenance.get("views", ()) if view["good_pixels"] == 0)
 
 
 @contextmanager
