@@ -17,6 +17,7 @@ from tofcapture.ops.normals import normals_from_depth
 from tofcapture.ops.phase import Decoder, TapNoise, ambiguity, frequencies, phasors, radial_to_range, taps
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError
 from tofcapture_model.augment import (
+    BurstNoise,
     RawItem,
     crop,
     flip,
@@ -130,17 +131,18 @@ def test_redrawn_noise_is_that_of_one_frame():
     assert one.shape == (8, 6, 6)
 
 
-def test_a_redrawn_frame_is_decoded_like_a_frame_of_the_burst():
+@pytest.mark.parametrize("full_scale", [4095.0, 16383.0])
+def test_a_redrawn_frame_is_decoded_like_a_frame_of_the_burst(full_scale):
     """Depth, gap, confidence and phasors scatter about the same means by as much as those of decoded single frames."""
     noise, rng, clean = TapNoise(16.0, 1.25), np.random.default_rng(3), clean_taps()
-    info = TofInfo("", "", CAMERA, LIGHT, range_errors=ERRORS)
+    info = TofInfo("", "", CAMERA, LIGHT, range_errors=ERRORS, saturation=full_scale)
     burst = rng.poisson(np.broadcast_to(clean, (400, *clean.shape)) * 16) / 16
     burst = np.rint(burst + 1.25 * rng.standard_normal(burst.shape))
     decoder = frame_decoder(info, CAMERA)
     real = [make_frame(raw, info, CAMERA, decoder=decoder) for raw in burst]
     mean = batched(make_frame(burst.mean(0), info, CAMERA, decoder=decoder))
     generator = torch.Generator().manual_seed(4)
-    drawn = [redraw_frame(mean, generator, averaged=400, noise=noise) for _ in range(400)]
+    drawn = [redraw_frame(mean, generator, BurstNoise(400, noise, full_scale)) for _ in range(400)]
     for field in ("depth", "gap", "confidence", "phasor"):
         a = torch.stack([getattr(f, field) for f in real])
         b = torch.stack([getattr(f, field)[0] for f in drawn])

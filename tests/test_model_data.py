@@ -190,4 +190,4 @@ def test_the_command_trains_on_several_datasets(dataset, other, tmp_path, capsys
     assert digest in card
     assert f"tofcapture train {dataset} {other} --out" in card
     assert main(["train", str(dataset), *out]) == 3
-    assert "another configuration, dataset or budget" in capsys.readouterr().out
+    assert "another configuration, dataset, budget" in capsys.readouterr().out

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 torch = pytest.importorskip("torch")
+from torch import nn
 
 from tofcapture.camera import Camera
 from tofcapture_model.geometry import (
@@ -22,6 +23,7 @@ from tofcapture_model.geometry import (
     unit,
     unproject,
 )
+from tofcapture_model.metrics import angles_deg
 from tofcapture_model.refine import Refinement
 
 CAMERA = Camera(60, 48, 190.6, 200.8, 29.2, 22.7)
@@ -143,8 +145,8 @@ def test_propagation_denoises_and_respects_jumps():
     assert (moved - truth).abs().max() < 0.003
 
 
-def test_untrained_refinement_is_the_identity_and_can_learn():
-    """Gains start at zero: nothing changes, but they receive a gradient."""
+def test_untrained_refinement_takes_what_the_geometry_says_and_can_learn():
+    """Gains start at one: normals are those of the depth, whatever they were; depth is smoother; without gains nothing changes."""
     refinement = Refinement(2, 1)
     depth, normal = plane(CAMERA, 0.2, 0.1, dtype=torch.float32)
     noisy = depth + 0.002 * torch.randn(depth.shape, generator=torch.Generator().manual_seed(0))
@@ -153,7 +155,16 @@ def test_untrained_refinement_is_the_identity_and_can_learn():
         + 0.1 * torch.randn(1, 3, *CAMERA.shape, generator=torch.Generator().manual_seed(2))
     )
     out, turned = refinement(noisy, normals, torch.full_like(depth, 0.003), intrinsics(CAMERA, torch.float32))
+    truth = normal[None, :, None, None].expand_as(turned)
+    assert (
+        angles_deg(turned.flatten(2), truth.flatten(2)).mean()
+        < 0.3 * angles_deg(normals.flatten(2), truth.flatten(2)).mean()
+    )
+    assert (out - depth).std() < 0.6 * (noisy - depth).std()
+    (out - depth).square().mean().backward()
+    assert (refinement.depth_gain.grad != 0).all()
+    nn.init.zeros_(refinement.depth_gain)
+    nn.init.zeros_(refinement.normal_gain)
+    out, turned = refinement(noisy, normals, torch.full_like(depth, 0.003), intrinsics(CAMERA, torch.float32))
     assert torch.equal(out, noisy)
     torch.testing.assert_close(turned, normals)
-    (out - depth).square().mean().backward()
-    assert (refinement.depth_gain.grad < 0).all()

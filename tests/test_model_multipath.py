@@ -10,6 +10,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from tofcapture.rig import SPEED_OF_LIGHT
+from tofcapture_model import multipath
 from tofcapture_model.geometry import rays
 from tofcapture_model.multipath import SIGNAL, bounce_error, cues, halo_error
 
@@ -43,6 +44,26 @@ def test_a_corner_looks_deeper_and_a_wall_does_not():
     wall = torch.full((1, 1, *SHAPE), 0.8)
     flat = bounce_error(wall, torch.ones_like(wall), torch.full_like(wall, 0.5 * SIGNAL / 0.64), K, HZ)
     assert flat.abs().max() < 0.1 * errors[1]
+
+
+def test_patches_are_as_large_and_as_white_as_the_wall_that_they_are_of(monkeypatch):
+    """Over the whole image, and beyond its border, where the wall goes on."""
+    seen = []
+    transfer = multipath._transfer
+
+    def spy(p, n, area, k):
+        seen.append(area)
+        return transfer(p, n, area, k)
+
+    monkeypatch.setattr(multipath, "_transfer", spy)
+    z, r = 0.8, rays(K, *SHAPE)
+    distance = z * r.norm(dim=1, keepdim=True)
+    amplitude = 0.5 * SIGNAL * (z / distance) / distance.square()
+    wall = torch.full((1, 1, *SHAPE), z)
+    maps = multipath.surface(wall, torch.ones_like(wall), amplitude, K)
+    torch.testing.assert_close(maps[:, 4], torch.full_like(maps[:, 4], 0.5), rtol=0.02, atol=0)
+    multipath.exchange_error(maps, K, HZ, step=10, margin=3)
+    torch.testing.assert_close(seen[0], torch.full_like(seen[0], (10 * z / 90) ** 2), rtol=1e-4, atol=0)
 
 
 def test_dark_scenes_have_no_bounce():

@@ -26,8 +26,10 @@ from tofcapture_model.checkpoint import load_model, load_resume
 from tofcapture_model.config import Network, Stage, preset
 from tofcapture_model.data import FrameDataset, batched
 from tofcapture_model.evaluate import evaluate
+from tofcapture_model.learner import Learner
 from tofcapture_model.predict import png_bytes, predict
-from tofcapture_model.train import train
+from tofcapture_model.runlog import Position
+from tofcapture_model.train import _Run, train
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +48,11 @@ def tiny():
         training=replace(base.training, batch=3, crop=(48, 64)),
         stages=(Stage("joint", 2, 1e-2),),
     )
+
+
+def tiny_steps(dataset, config, folder):
+    """Steps of a whole run."""
+    return train(config, dataset, folder / "whole").steps
 
 
 @pytest.fixture(scope="module")
@@ -128,10 +135,48 @@ def test_drawn_noise_is_another_one_at_every_step_and_resumes_to_the_same_bits(d
 
 
 def test_a_loss_that_is_not_finite_stops_before_it_spoils_anything(dataset, tiny, tmp_path):
-    """An absurd learning rate: a clear error, and the last resume point is finite."""
+    """An absurd learning rate, or a gradient that explodes while its loss does not: a clear error, and no step."""
     config = replace(tiny, stages=(Stage("joint", 50, 1e30),))
-    with pytest.raises(DataError, match="finite loss"):
+    with pytest.raises(DataError, match="finite"):
         train(config, dataset, tmp_path / "run")
+
+
+def test_a_gradient_that_is_not_finite_is_not_followed(dataset, tiny, tmp_path, monkeypatch):
+    """The loss is sound, the gradient is not: the weights stay as they are."""
+    start = []
+
+    def spoilt(learner, loss):
+        start.append(learner.parameters[0].detach().clone())
+        norm = gradient(learner, loss)
+        learner.parameters[0].grad.fill_(torch.nan)
+        assert np.isfinite(norm)
+        return float(torch.nan)
+
+    gradient = Learner.gradient
+    monkeypatch.setattr(Learner, "gradient", spoilt)
+    steps = []
+    monkeypatch.setattr(Learner, "step", lambda *_: steps.append(1))
+    with pytest.raises(DataError, match="finite gradient, got nan at step 1"):
+        train(tiny, dataset, tmp_path / "run")
+    assert steps == []
+
+
+def test_short_stages_get_a_tenth_of_a_budget(dataset, tiny, tmp_path):
+    """Five epochs of 695 would be seconds; the budget is shared out whole all the same."""
+    stages = (Stage("depth", 230), Stage("normal", 460), Stage("refine", 5))
+    run = _Run(replace(preset("paper"), stages=stages), None, None, tmp_path, "", 10.0, Position(), {}, {})
+    shares = [run.budget(stage) for stage in stages]
+    assert sum(shares) == pytest.approx(600)
+    assert shares[2] > 0.09 * 600
+    assert shares[1] == pytest.approx(2 * shares[0])
+
+
+def test_a_resumed_run_remembers_its_losses(dataset, tiny, tmp_path):
+    """The run's card and provenance have the last that were logged, also when none was logged since."""
+    out = tmp_path / "run"
+    stopped = train(tiny, dataset, out, stop_after=tiny_steps(dataset, tiny, tmp_path) - 1)
+    assert stopped.losses
+    assert train(tiny, dataset, out).losses == stopped.losses
 
 
 def test_the_paper_s_stages_run_in_order(dataset, tiny, tmp_path):

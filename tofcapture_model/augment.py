@@ -26,6 +26,24 @@ FULL_SCALE = 4095.0  # raw units where a 12-bit sensor saturates
 _ORDERS = (0, 2, 4)  # of the phase: offset, and the wiggling of sensors with four phases
 
 
+class BurstNoise(NamedTuple):
+    """What it takes to draw the noise of a frame anew.
+
+    Attributes
+    ----------
+    averaged
+        Frames that a given one is the mean of.
+    noise
+        Of one tap of one frame.
+    full_scale
+        Raw value of saturation.
+    """
+
+    averaged: float
+    noise: TapNoise
+    full_scale: float
+
+
 class RawItem(NamedTuple):
     """A raw frame with all that its geometry depends on; any leading batch axes, the same for all.
 
@@ -138,7 +156,8 @@ def scale_albedo(
     """
     noise = noise or TapNoise()
     taps = raw.to(torch.float32)
-    scale = torch.as_tensor(factor, dtype=torch.float32, device=taps.device)
+    # a number stays on the host, where it can be looked at without waiting for a GPU
+    scale = factor.to(taps) if isinstance(factor, Tensor) else torch.tensor(factor, dtype=torch.float32)
     if not bool((scale > 0).all()) or bool(((scale > 1) & (scale**2 > averaged)).any()):
         raise ConfigError(
             f"scale_albedo: expected positive factors up to {max(averaged, 1.0) ** 0.5:g}, got up to {scale.max():g}",
@@ -182,14 +201,7 @@ def redraw_noise(
     return scale_albedo(taps, 1.0, 0.0, generator, averaged=averaged, noise=noise, full_scale=full_scale)
 
 
-def redraw_frame(
-    frame: Frame,
-    generator: torch.Generator,
-    *,
-    averaged: float,
-    noise: TapNoise | None = None,
-    full_scale: float = FULL_SCALE,
-) -> Frame:
+def redraw_frame(frame: Frame, generator: torch.Generator, burst: BurstNoise) -> Frame:
     """One more frame of a static burst, decoded: fresh noise on the taps, and what it does to phasors, depth and gap.
 
     The turn of each phasor moves the range of its frequency, so calibration and wraps stay those of the mean. Cues stay, too:
@@ -198,18 +210,17 @@ def redraw_frame(
     Parameters
     ----------
     frame
-        Decoded from the mean of ``averaged`` frames; (B, ., H, W).
-    generator, averaged, noise, full_scale
-        As for :func:`redraw_noise`; the generator is of the frame's device.
+        Decoded from the mean of ``burst.averaged`` frames; (B, ., H, W).
+    generator
+        Of the frame's device.
+    burst
+        Noise of its frames.
 
     Returns
     -------
     A frame like one of the burst: same statistics of raw, phasor, depth, confidence and gap.
     """
-    raw = redraw_noise(
-        frame.raw * full_scale, generator, averaged=averaged, noise=noise, full_scale=full_scale
-    )
-    raw = raw / full_scale
+    raw = redraw_noise(frame.raw * burst.full_scale, generator, **burst._asdict()) / burst.full_scale
     phasor = torch.einsum("bck,bkhw->bchw", frame.demodulation, raw)
     low = turn(phasor[:, :2], frame.phasor[:, :2]) * metres_per_radian(frame, 0)
     high = turn(phasor[:, 2:], frame.phasor[:, 2:]) * metres_per_radian(frame, 1)

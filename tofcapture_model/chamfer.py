@@ -70,8 +70,8 @@ def robust_chamfer(
     normals
         (B, 3, H, W) unit normals of Q: distances to the tangent plane at q instead of to q; neighbours stay the nearest points.
     softness
-        m^2: above 0 the least of the seven is a soft one, ``-softness log mean exp(-loss / softness)``, which has no
-        false minima of its own and tends to the mean for a large, to the least for a small softness.
+        m^2: above 0 the least of the seven is a soft one, ``-softness log mean exp(-loss / softness)``. It tends to the mean for a large softness,
+        whose only minimum is the right place, and to the least, with its seven, for a small one.
 
     Returns
     -------

@@ -6,12 +6,13 @@ from the defaults below, which are the paper's.
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from tofcapture.errors import ConfigError
 
@@ -75,7 +76,19 @@ class Network:
             "some of raw, confidence, depth",
             self.inputs,
         )
-        _require(all(w > 0 for w in self.windows), "network.windows", "positive radii", self.windows)
+        compact = self.kind == "compact"
+        _require(
+            not compact or set(self.inputs) == set(SOURCES),
+            "network.inputs",
+            "all of them for compact",
+            self.inputs,
+        )
+        _require(
+            all(w > 0 for w in self.windows) and (len(self.windows) > 0 or not compact),
+            "network.windows",
+            "positive radii, for compact one at least",
+            self.windows,
+        )
         _require(self.max_residual >= 0, "network.max_residual", "metres >= 0", self.max_residual)
         _require(
             self.refine_iterations >= 0 and self.refine_radius > 0,
@@ -104,6 +117,10 @@ class Losses:
         Distance of normals: ``cosine``, eq. 3 (paper), or ``angle``, whose gradient does not fade with the angle.
     depth, chamfer, error, normal
         Weights of eq. 1, eq. 2 (in 1/mm^2), the error map, the normals.
+    chamfer_softness
+        mm^2: above 0 the least of the seven distances of eq. 2 is a soft one, which pulls even where a shifted copy fits best.
+    chamfer_distance
+        ``point``, to the nearest point (paper), or ``plane``, to the tangent plane there.
     context
         Weight of measured surface outside the object crop relative to the object.
     """
@@ -115,6 +132,8 @@ class Losses:
     normals: str = "cosine"
     depth: float = 1.0
     chamfer: float = 0.01
+    chamfer_softness: float = 0.0
+    chamfer_distance: str = "point"
     error: float = 1.0
     normal: float = 1.0
     context: float = 0.0
@@ -126,11 +145,19 @@ class Losses:
         _require(
             self.uncertainty in ("l1", "laplace"), "losses.uncertainty", "l1 or laplace", self.uncertainty
         )
-        _require(self.normals in ("cosine", "angle"), "losses.normals", "cosine or angle", self.normals)
         _require(
-            min(self.depth, self.chamfer, self.error, self.normal, self.context) >= 0,
+            self.chamfer_distance in ("point", "plane"),
+            "losses.chamfer_distance",
+            "point or plane",
+            self.chamfer_distance,
+        )
+        _require(self.chamfer_softness >= 0, "losses.chamfer_softness", "mm^2 >= 0", self.chamfer_softness)
+        _require(self.normals in ("cosine", "angle"), "losses.normals", "cosine or angle", self.normals)
+        weights = (self.depth, self.chamfer, self.error, self.normal)
+        _require(
+            min(*weights, self.context) >= 0 and max(weights) > 0,
             "losses",
-            "weights >= 0",
+            "weights >= 0, one of depth, chamfer, error, normal above",
             self,
         )
 
@@ -206,7 +233,8 @@ class Training:
             self.precision,
         )
         _require(self.noise in ("recorded", "drawn"), "training.noise", "recorded or drawn", self.noise)
-        _require(self.frames >= 0, "training.frames", ">= 0", self.frames)
+        for key in ("frames", "validate_every", "seed"):
+            _require(getattr(self, key) >= 0, f"training.{key}", ">= 0", getattr(self, key))
         _require(0 <= self.phase_error < 0.5, "training.phase_error", "radians, 0 to 0.5", self.phase_error)
         _require(
             len(self.crop) in (0, 2) and all(c >= 32 for c in self.crop),
@@ -238,6 +266,8 @@ class Config:
         _require(not (shared and split), "stages", "joint or refine, as compact shares its backbone", split)
         foreign = [s.name for s in self.stages if self.network.kind in BASELINES and s.name != "depth"]
         _require(not foreign, "stages", f"depth only, as {self.network.kind} answers with depth", foreign)
+        own = self.network.kind not in BASELINES or self.losses == Losses()
+        _require(own, "losses", f"none, as {self.network.kind} brings its own", self.losses)
         idle = self.network.refine_iterations == 0 and any(s.name == "refine" for s in self.stages)
         _require(not idle, "stages", "no refine stage without refine_iterations", "refine")
 
@@ -255,14 +285,21 @@ def _changed(part: Part, table: Any, where: str) -> Part:
         raise ConfigError(
             f"{where}: unknown key {', '.join(sorted(unknown))}", hint=f"known: {', '.join(sorted(known))}"
         )
-    values: dict[str, Any] = {}
-    for key, raw in table.items():
-        default = getattr(part, key)
-        value = tuple(raw) if isinstance(raw, list) else raw
-        values[key] = float(value) if isinstance(default, float) and type(value) is int else value
-        if type(values[key]) is not type(default):
-            raise ConfigError(f"{where}.{key}: expected {type(default).__name__}, got {raw!r}")
-    return replace(part, **values)
+    hints = get_type_hints(type(part))
+    return replace(part, **{key: _typed(raw, hints[key], f"{where}.{key}") for key, raw in table.items()})
+
+
+def _typed(raw: Any, hint: Any, where: str) -> Any:
+    """Check a TOML value against a field's type: int, float (whole numbers, too, but finite), bool, str, or a tuple of one of them."""
+    of = get_args(hint)  # tuple[int, ...]
+    if of:
+        if not isinstance(raw, list):
+            raise ConfigError(f"{where}: expected a list of {of[0].__name__}, got {raw!r}")
+        return tuple(_typed(one, of[0], where) for one in raw)
+    value = float(raw) if hint is float and type(raw) is int else raw
+    if type(value) is not hint or (hint is float and not math.isfinite(value)):
+        raise ConfigError(f"{where}: expected {hint.__name__}, got {raw!r}")
+    return value
 
 
 def config_from_dict(table: Mapping[str, Any], where: str = "config") -> Config:
@@ -280,6 +317,8 @@ def config_from_dict(table: Mapping[str, Any], where: str = "config") -> Config:
     base = preset(str(table["preset"])) if "preset" in table else Config()
     stages = base.stages
     if "stage" in table:
+        if not isinstance(table["stage"], list):
+            raise ConfigError(f"{where}: stage: expected tables [[stage]], got {table['stage']!r}")
         for i, stage in enumerate(table["stage"]):
             if not isinstance(stage, Mapping) or "name" not in stage or "epochs" not in stage:
                 raise ConfigError(f"{where}: stage {i}: expected name and epochs, got {stage!r}")

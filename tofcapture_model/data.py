@@ -21,8 +21,9 @@ from tofcapture.files.layout import MaskBit
 from tofcapture.files.packed import PackedScene
 from tofcapture.files.shard import ShardReader
 from tofcapture.frames import TofInfo
-from tofcapture.ops.phase import Decoder, frequencies
+from tofcapture.ops.phase import Decoder, TapNoise, frequencies, photon_transfer
 from tofcapture.ops.phase.float32 import tap_weights
+from tofcapture_model.augment import BurstNoise
 from tofcapture_model.frame import NO_MAPS, Frame, Target
 from tofcapture_model.multipath import cues
 from tofcapture_model.shards import SampleId, all_samples, open_scenes
@@ -30,6 +31,7 @@ from tofcapture_model.shards import SampleId, all_samples, open_scenes
 Float32 = NDArray[np.float32]
 MODEST = 1.5e9  # bytes, where the system does not tell what it has
 TABLES = 110  # bytes per pixel of a decoder and its camera's rays, one for each scene
+_MEASURED = 16  # scenes whose first burst the noise is measured on
 MAX_RANGE = 5.0  # m; a decoded depth beyond it is an unwrapping failure on this rig and counts as a hole
 
 
@@ -160,7 +162,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
     frames
         Use only the first so many frames of every view; 0: all.
     mean
-        One item per view: the mean of its frames, for noise that is drawn again (:func:`tofcapture_model.augment.redraw_frame`).
+        One item per view: the mean of its frames, for noise that is drawn again; ``burst`` tells which, ``None`` without this.
     cache_bytes
         Decoded frames and their ground truth are kept in memory up to this size; others are decoded again each time.
     cache
@@ -200,6 +202,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
                 hint="record more scenes, or choose another --split",
             )
         _expect_alike(self.readers, self.size)
+        self.burst = _burst_noise(self.readers, self.averaged) if mean else None
         self._room = cache_bytes - sum(
             TABLES * r.camera.width * r.camera.height for r in self.readers.values()
         )
@@ -302,6 +305,20 @@ def spare_memory() -> float:
         limit = int((group / "memory.max").read_text())
         spare = min(spare, limit - int((group / "memory.current").read_text()))
     return max(spare, 0.0) / 2 / processes
+
+
+def _burst_noise(readers: Mapping[str, ShardReader | PackedScene], frames: int) -> BurstNoise:
+    """Noise of the frames that a mean of ``frames`` stands for, measured on the bursts of some scenes (single frames tell nothing)."""
+    saturations = {reader.info.saturation for reader in readers.values()}
+    if len(saturations) > 1:
+        raise ConfigError(
+            f"training.noise = drawn: expected cameras that saturate alike, got {', '.join(f'{s:g}' for s in sorted(saturations))}",
+            hint='train on them apart, or with training.noise = "recorded"',
+        )
+    some = [readers[name] for name in sorted(readers)][:: -(-len(readers) // _MEASURED)]
+    bursts = (np.stack([reader.raw(0, f) for f in range(frames)]) for reader in some)
+    full_scale = saturations.pop()
+    return BurstNoise(frames, photon_transfer(bursts, full_scale) if frames > 1 else TapNoise(), full_scale)
 
 
 def _averaged(readers: Iterable[ShardReader | PackedScene], frames: int) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -81,13 +82,24 @@ def _moment_filters(radius: int, like: Tensor) -> tuple[Tensor, Tensor]:
     return rows.reshape(6, 3, 1, -1), columns.reshape(10, 6, -1, 1)
 
 
+@contextmanager
+def _whole_float32(device: torch.device) -> Iterator[None]:
+    """Convolve in float32 all through: moments need more than the 8 bits of mantissa of bfloat16, and than the 11 of TF32 on GPUs."""
+    now = torch.backends.cudnn
+    with (
+        torch.autocast(device.type, enabled=False),
+        now.flags(now.enabled, now.benchmark, now.benchmark_limit, now.deterministic, allow_tf32=False),
+    ):
+        yield
+
+
 def _moments(images: Tensor, radius: int) -> Tensor:
     """Sums (B, 10, H, W) over every window of images (B, 3, H, W) a, b, c: ``a (1, v, vv, u, uv, uu), b (1, v, u), c``.
 
     All at once: convolutions of one channel run at a fraction of a processor's speed.
     """
     rows, columns = _moment_filters(radius, images)
-    with torch.autocast(images.device.type, enabled=False):  # eight bits of mantissa hold no moments
+    with _whole_float32(images.device):
         return F.conv2d(F.conv2d(images, rows, padding=(0, radius)), columns, padding=(radius, 0))
 
 

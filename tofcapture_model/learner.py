@@ -7,18 +7,20 @@ import os
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from tofcapture_model.augment import redraw_calibration, redraw_frame
+from tofcapture.errors import ConfigError
+from tofcapture_model.augment import BurstNoise, redraw_calibration, redraw_frame
 from tofcapture_model.config import Config, Stage
 from tofcapture_model.frame import Estimate, Frame, Target, frame_to, target_to
 from tofcapture_model.losses import Objective
 from tofcapture_model.runlog import Position
 from tofcapture_model.zoo import Model, select_stage, training_loss
 
+T = TypeVar("T")
 WARM_UP = 0.02  # of a stage, with a cosine schedule
 MAX_NORM = 1.0  # of the gradient
 
@@ -38,6 +40,14 @@ class Group(NamedTuple):
     world: int
     place: torch.device
 
+    def shared(self, value: T) -> T:
+        """What the first process says, on all of them."""
+        if self.world == 1:
+            return value
+        held = [value]
+        torch.distributed.broadcast_object_list(held, src=0, device=self.place)
+        return held[0]
+
     def slowest(self, seconds: float) -> float:
         """Most seconds of all processes, so that all of them stop at the same step."""
         if self.world == 1:
@@ -49,17 +59,36 @@ class Group(NamedTuple):
 
 @contextmanager
 def processes(device: str) -> Iterator[Group]:
-    """Join the group that ``torchrun`` announces in the environment; with CUDA each process takes its own device."""
-    world, cuda = int(os.environ.get("WORLD_SIZE", "1")), torch.cuda.is_available()
+    """Join the group that ``torchrun`` announces in the environment; on ``cuda`` each process takes a GPU of its own.
+
+    Raises
+    ------
+    ConfigError
+        More processes on this machine than GPUs.
+    """
+    world, place = int(os.environ.get("WORLD_SIZE", "1")), torch.device(device)
+    if place.type == "cuda":
+        place = _own_gpu(place, world)
     if world == 1:
-        yield Group(0, 1, torch.device(device))
+        yield Group(0, 1, place)
         return
-    place = torch.device(f"cuda:{os.environ['LOCAL_RANK']}" if cuda else device)
-    torch.distributed.init_process_group("nccl" if cuda else "gloo")
+    torch.distributed.init_process_group("nccl" if place.type == "cuda" else "gloo")
     try:
         yield Group(torch.distributed.get_rank(), world, place)
     finally:
         torch.distributed.destroy_process_group()
+
+
+def _own_gpu(place: torch.device, world: int) -> torch.device:
+    """The GPU of this process, made the current one: compiled kernels are launched there, wherever their tensors are."""
+    index = int(os.environ["LOCAL_RANK"]) if world > 1 else place.index or 0
+    if index >= torch.cuda.device_count():
+        raise ConfigError(
+            f"expected a GPU for every process, got process {index + 1} on {torch.cuda.device_count()}",
+            hint="torchrun --nproc-per-node with the number of GPUs, or --device cpu",
+        )
+    torch.cuda.set_device(index)
+    return torch.device("cuda", index)
 
 
 class Learner:
@@ -98,23 +127,23 @@ class Learner:
                     k: v if k == "step" else torch.empty_like(parameter).copy_(v) for k, v in saved.items()
                 }
 
-    def loss(self, frame: Frame, target: Target, averaged: int, position: Position) -> Objective:
+    def loss(self, frame: Frame, target: Target, burst: BurstNoise | None, position: Position) -> Objective:
         """Answer a batch and hold it against the truth.
 
         Parameters
         ----------
         frame, target
             On any device.
-        averaged
-            Frames whose mean each item is; their noise is drawn again then. 0: items are single frames and stay as they are.
+        burst
+            Of whose frames each item is the mean; their noise is drawn again then. ``None``: items are single frames and stay as they are.
         position
             Seeds what is drawn: a resumed run draws what an unbroken one would have.
         """
         training, place = self.config.training, self.group.place
         frame, target = frame_to(frame, place), target_to(target, place)
         drawn = self._generator(position)
-        if averaged:
-            frame = redraw_frame(frame, drawn, averaged=averaged)
+        if burst:
+            frame = redraw_frame(frame, drawn, burst)
         if training.phase_error:
             frame = redraw_calibration(frame, drawn, training.phase_error)
         with torch.autocast(place.type, torch.bfloat16, enabled=training.precision == "bfloat16"):
@@ -126,13 +155,16 @@ class Learner:
         seed = f"{self.config.training.seed}/{position.stage}/{position.step}/{self.group.rank}"
         return torch.Generator(self.group.place).manual_seed(zlib.crc32(seed.encode()))
 
-    def step(self, loss: Objective, rate: float) -> None:
-        """Follow the gradient of a loss, clipped."""
-        for parameters in self.optimizer.param_groups:
-            parameters["lr"] = rate
+    def gradient(self, loss: Objective) -> float:
+        """Gradient of a loss, clipped; returns the norm that it had."""
         self.optimizer.zero_grad(set_to_none=True)
         loss.total.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self.parameters, MAX_NORM)
+        return float(nn.utils.clip_grad_norm_(self.parameters, MAX_NORM))
+
+    def step(self, rate: float) -> None:
+        """Follow the gradient."""
+        for parameters in self.optimizer.param_groups:
+            parameters["lr"] = rate
         self.optimizer.step()
 
 

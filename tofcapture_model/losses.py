@@ -184,4 +184,8 @@ def objective(
 def _chamfer(weights: Losses, depth: Tensor, target: Target, intrinsics: Tensor) -> Chamfer:
     """Robust Chamfer between the clouds over the good pixels (both clouds live where the ground truth does)."""
     p, q = unproject(depth, intrinsics), unproject(target.depth, intrinsics)
-    return robust_chamfer(p, q, target.good, target.good, intrinsics, weights.jitter)
+    normals = target.normals if weights.chamfer_distance == "plane" else None
+    softness = weights.chamfer_softness / _PER_MM2
+    return robust_chamfer(
+        p, q, target.good, target.good, intrinsics, weights.jitter, normals=normals, softness=softness
+    )

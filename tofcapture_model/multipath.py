@@ -132,14 +132,17 @@ def bounce_error(
 
 
 def surface(depth: Tensor, valid: Tensor, amplitude: Tensor, intrinsics: Tensor) -> Tensor:
-    """Tangent planes and light of every pixel (B, 5, H, W): unit normal, ``n . p`` in metres, amplitude times squared depth."""
+    """Tangent plane and albedo of every pixel (B, 5, H, W): unit normal, ``n . p`` in metres, albedo by the measured amplitude."""
     planes, _ = side_window_planes(depth, valid + 1e-3, 2)
     normals = plane_normals(planes, intrinsics)
     smooth = (1 / planes[:, :1].clamp_min(0.1)) * valid + depth * (1 - valid)
-    # n . p, negative
-    distance = (normals * rays(intrinsics, *depth.shape[-2:])).sum(1, keepdim=True) * smooth
+    ray = rays(intrinsics, *depth.shape[-2:])
+    slope = (normals * ray).sum(1, keepdim=True)  # negative
+    square = ray.square().sum(1, keepdim=True)
     light = F.avg_pool2d(amplitude, 3, 1, 1, count_include_pad=False) * valid
-    return torch.cat([normals, distance, light * smooth.square()], dim=1)
+    direct = (-slope / square.sqrt()).clamp_min(_GRAZING) / (square * smooth.square())
+    albedo = (light / SIGNAL / direct).clamp_max(_WHITEST)
+    return torch.cat([normals, slope * smooth, albedo], dim=1)
 
 
 def exchange_error(
@@ -162,7 +165,7 @@ def exchange_error(
 
 
 def _exchange(maps: Tensor, r: Tensor, grid: Tensor, hz: float) -> Tensor:
-    """Depth error (N,) of patches (5, N): normal, plane distance, amplitude times squared depth; rays (3, N)."""
+    """Depth error (N,) of patches (5, N): normal, plane distance, albedo; rays (3, N)."""
     n = maps[:3].T
     slope = (maps[:3] * r).sum(0).clamp_max(-_GRAZING / 2)
     z = (maps[3] / slope).clamp(0.1, _FAR)
@@ -170,11 +173,11 @@ def _exchange(maps: Tensor, r: Tensor, grid: Tensor, hz: float) -> Tensor:
     k = 4 * math.pi * hz / SPEED_OF_LIGHT  # phase per metre of range, which is half a path
     distance = p.norm(dim=1)
     facing = (-(p * n).sum(1) / distance).clamp_min(_GRAZING)
-    surface = z.square() / (grid[0] * grid[1]) / facing
+    # a pixel's solid angle is (z / d)^3 / (fx fy)
+    surface = z.pow(3) / distance / (grid[0] * grid[1]) / facing
     transfer = _transfer(p, n, surface, k)
     direct = torch.polar(facing / distance.square(), k * distance / 2)
-    albedo = (maps[4] / z.square() / SIGNAL / direct.abs()).clamp_max(_WHITEST)
-    radiosity = albedo * direct
+    albedo, radiosity = maps[4], maps[4] * direct
     for _ in range(BOUNCES):
         indirect = transfer @ radiosity
         radiosity = albedo * (direct + indirect)

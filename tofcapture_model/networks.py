@@ -1,7 +1,8 @@
 """The three networks of the paper, and their compact siblings: inputs and heads.
 
-Every head answers at twice the resolution and starts as the identity: depth as the decoded ToF depth, normals as the
-classical ones, so that an untrained model is the sensor and training can only be judged by what it adds.
+Every head answers at twice the resolution. Depth starts as the decoded ToF depth, normals of ``compact`` as those of planes fitted to it; those of
+the paper's network start towards the camera, and its refinement makes them those of the depth. So an untrained model that sees the decoded depth is the
+sensor, and training can only be judged by what it adds.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Joint refinement: depth to normals to depth, a few rounds (paper section IV-C, after GeoNet).
 
-The geometry has no parameters; each round learns two gains, which start at zero. A bad normal map can make depth worse, so
-every round asks the plane of a neighbour only where normals agree and its vote lies near (``propagate_depth``), trusts
+The geometry has no parameters; each round learns two gains, which start at one: what the geometry says is taken whole, as in GeoNet,
+until training knows better. A bad normal map can make depth worse, so every round asks the plane of a neighbour only where normals agree and its vote lies near (``propagate_depth``), trusts
 neighbours by the inverse square of their expected error, and goes only as far as its gain says.
 """
 
@@ -22,8 +22,8 @@ class Refinement(nn.Module):
     def __init__(self, iterations: int, radius: int) -> None:
         super().__init__()
         self.radius = radius
-        self.depth_gain = nn.Parameter(torch.zeros(iterations))
-        self.normal_gain = nn.Parameter(torch.zeros(iterations))
+        self.depth_gain = nn.Parameter(torch.full((iterations,), 1 / _GAIN_UNIT))
+        self.normal_gain = nn.Parameter(torch.full((iterations,), 1 / _GAIN_UNIT))
 
     def forward(
         self, depth: Tensor, normals: Tensor, error: Tensor, intrinsics: Tensor

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from shutil import which
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -11,8 +14,8 @@ from tofcapture_model.tiles import TILE
 
 
 def usable(device: torch.device) -> bool:
-    """Whether the compiled search runs there: on a GPU with Triton, which PyTorch's wheels for GPUs bring along."""
-    if device.type != "cuda":
+    """Whether the compiled search runs there: on a GPU with Triton, which PyTorch's wheels for GPUs bring along, and a C compiler, which Triton asks for."""
+    if device.type != "cuda" or not any(which(c) for c in (os.environ.get("CC", "gcc"), "gcc", "clang")):
         return False
     try:
         from tofcapture_model.kernels import nearest_tiles  # noqa: F401
@@ -73,10 +76,13 @@ class _Clouds:
         shape = (len(shifts), 2, tiles, kernel.POINTS)
         squared = torch.empty(shape, device=shifts.device)
         codes = torch.empty(shape if with_codes else 0, device=shifts.device, dtype=torch.int32)
-        kernel.search[(tiles, 2 * len(shifts))](
-            self.points, self.boxes, shifts, squared, codes, tiles,
-            WITH_CODES=with_codes, POINTS=kernel.POINTS, PART=kernel.PART, BLOCK=kernel.BLOCK, num_warps=1,
-        )  # fmt: skip
+        with torch.cuda.device_of(
+            self.points
+        ):  # Triton launches on the current GPU, whichever the tensors are on
+            kernel.search[(tiles, 2 * len(shifts))](
+                self.points, self.boxes, shifts, squared, codes, tiles,
+                WITH_CODES=with_codes, POINTS=kernel.POINTS, PART=kernel.PART, BLOCK=kernel.BLOCK, num_warps=1,
+            )  # fmt: skip
         return squared, codes
 
     def found(self, shifts: Tensor) -> list[Found]:

@@ -32,13 +32,13 @@ from tofcapture_model.evaluate import calibrate, model_method, score
 from tofcapture_model.joint import JointModel
 from tofcapture_model.learned import learned_from
 from tofcapture_model.learner import Group, Learner, processes, scheduled_rate
-from tofcapture_model.losses import Objective
 from tofcapture_model.run_card import write_card
 from tofcapture_model.runlog import Log, Position
 from tofcapture_model.zoo import Model, build_model, compile_unets
 
 SAVE_EVERY = 60.0  # s between resume points
 LOG_EVERY = 20  # steps
+LEAST_SHARE = 0.1  # of a budget in minutes, for each stage
 Report = Callable[[str, float, str], None]
 
 
@@ -81,14 +81,21 @@ class _Run:
     losses: dict[str, float]
 
     def budget(self, stage: Stage) -> float | None:
-        """Seconds of a stage; stages share the budget by their epochs."""
+        """Seconds of a stage; stages share the budget by their epochs, but none gets much less than a tenth.
+
+        Five of the paper's 695 epochs are thousands of steps; as a share of some minutes they would be a handful.
+        """
         if self.minutes is None:
             return None
-        return 60 * self.minutes * stage.epochs / sum(s.epochs for s in self.config.stages)
+        shares = {
+            s: max(s.epochs / sum(t.epochs for t in self.config.stages), LEAST_SHARE)
+            for s in self.config.stages
+        }
+        return 60 * self.minutes * shares[stage] / sum(shares[s] for s in self.config.stages)
 
     def save(self, learner: Learner) -> None:
         """Write the resume point."""
-        state = {"key": self.key, **self.position.__dict__}
+        state = {"key": self.key, "losses": self.losses, **self.position.__dict__}
         save_resume(self.out / "resume.safetensors", self.model, learner.optimizer, learner.names, state)
 
     def ended(self, *, finished: bool) -> Trained:
@@ -127,7 +134,7 @@ def train(
     epochs
         Of every stage, instead of the configuration's.
     minutes
-        Budget of the whole run; stages share it by their epochs, schedules follow the clock.
+        Budget of the whole run; stages share it by their epochs, with a tenth or so for the shortest; schedules follow the clock.
     stop_after
         Stop, resumable, after so many steps in all.
     device
@@ -211,9 +218,10 @@ def _train_stage(
         for frame, target in DataLoader(data, batch_sampler=left, num_workers=workers, collate_fn=collate):
             progress = _progress(position, stage, len(batches), budget)
             rate = scheduled_rate(stage, training.schedule, progress)
-            loss = learner.loss(frame, target, data.averaged if data.mean else 0, position)
-            _expect_finite(loss, position, run.out)
-            learner.step(loss, rate)
+            loss = learner.loss(frame, target, data.burst, position)
+            _expect_finite("loss", float(loss.total.detach()), position, run.out)
+            _expect_finite("gradient", learner.gradient(loss), position, run.out)
+            learner.step(rate)
 
             position.step, position.batch = position.step + 1, position.batch + 1
             position.elapsed = group.slowest(time.monotonic() - started)
@@ -253,13 +261,12 @@ def _finish(run: _Run, dataset: Path, source: Mapping[str, Any]) -> None:
     save_model(run.out / "model.safetensors", run.model, run.config, provenance)
 
 
-def _expect_finite(loss: Objective, position: Position, out: Path) -> None:
+def _expect_finite(what: str, value: float, position: Position, out: Path) -> None:
     """Stop before a step that would spoil the weights."""
-    total = float(loss.total.detach())
-    if not math.isfinite(total):
+    if not math.isfinite(value):
         raise DataError(
-            f"{out}: expected a finite loss, got {total} at step {position.step + 1}",
-            hint="the last resume point is sound: check the dataset (tofcapture check), or lower the learning rate",
+            f"{out}: expected a finite {what}, got {value} at step {position.step + 1}",
+            hint="check the dataset (tofcapture check); if it is sound, take a lower learning_rate and another --out",
         )
 
 
@@ -291,28 +298,45 @@ def _digest(dataset: Path) -> str:
     return sha256_of(Path(dataset) / "manifest.json")
 
 
-def _key(config: Config, source: Mapping[str, Any], minutes: float | None) -> str:
+def _key(config: Config, source: Mapping[str, Any], minutes: float | None, world: int) -> str:
     """Digest of all that decides what a run computes; a resume point of another run is refused."""
     begun = source.get("start_sha256", "") + "".join(source.get("also", {}).values())
-    text = f"{dumps_config(config)}|{source['manifest_sha256']}|{minutes}{begun}"
+    several = f"|{world} processes" if world > 1 else ""
+    text = f"{dumps_config(config)}|{source['manifest_sha256']}|{minutes}{begun}{several}"
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _open_run(
     config: Config, model: Model, group: Group, out: Path, source: Mapping[str, Any], minutes: float | None
 ) -> _Run:
-    """Begin a run, or go on with the one in its folder: loads its weights into the model."""
-    key, path = _key(config, source, minutes), Path(out) / "resume.safetensors"
-    if not path.exists():
+    """Begin a run, or go on with the one in its folder: loads its weights into the model.
+
+    The first process reads it and tells the others, who may be on machines that do not see the folder.
+    """
+    out = Path(out)
+    key = _key(config, source, minutes, group.world)
+    weights, moments, state = group.shared(_resume_point(out, key) if group.rank == 0 else ({}, {}, {}))
+    if not state:
         return _Run(config, model, group, out, key, minutes, Position(), {}, {})
+    load_strictly(model, weights, out / "resume.safetensors")
+    losses = state.pop("losses", {})
+    return _Run(config, model, group, out, key, minutes, Position(**state), moments, losses)
+
+
+def _resume_point(
+    out: Path, key: str
+) -> tuple[dict[str, Tensor], dict[str, dict[str, Tensor]], dict[str, Any]]:
+    """Weights, Adam's moments and state of a run that is to go on; nothing where none was begun."""
+    path = out / "resume.safetensors"
+    if not path.exists():
+        return {}, {}, {}
     weights, moments, state = load_resume(path)
     if state.pop("key", None) != key:
         raise ConfigError(
-            f"{out}: holds a run with another configuration, dataset or budget",
+            f"{out}: holds a run with another configuration, dataset, budget or number of processes",
             hint="choose another --out, or delete it",
         )
-    load_strictly(model, weights, path)
-    return _Run(config, model, group, out, key, minutes, Position(**state), moments, {})
+    return weights, moments, state
 
 
 def _done(position: Position, stage: Stage, budget: float | None) -> bool:

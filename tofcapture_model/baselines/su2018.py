@@ -84,7 +84,8 @@ class ToFNet(Baseline):
         x = self.residual(self.down2(skip1))
         x = self.after1(F.relu(self.up1(x) + skip1))
         x = self.after2(F.relu(self.up2(x) + skip2))
-        out: Tensor = (torch.tanh(self.last(x).float()) + 1) * (FAR / 2)
+        with torch.autocast(x.device.type, enabled=False):  # eight bits of mantissa are steps of 12 mm here
+            out: Tensor = (torch.tanh(self.last(x.float())) + 1) * (FAR / 2)
         return out[..., top : top + h, left : left + w]
 
     def loss(self, estimate: Estimate, target: Target, frame: Frame) -> Tensor:

@@ -7,8 +7,9 @@ complex number ``A exp(i phi)``. Bursts are averaged as phasors, never as phases
 """
 
 from tofcapture.ops.phase.decode import Decoded, decode
-from tofcapture.ops.phase.decoder import Decoder, DepthMaps, Signals, TapNoise
+from tofcapture.ops.phase.decoder import Decoder, DepthMaps, Signals
 from tofcapture.ops.phase.flying import flying_pixels
+from tofcapture.ops.phase.noise import TapNoise, photon_transfer
 from tofcapture.ops.phase.phasor import (
     Complex128,
     Float64,
@@ -39,6 +40,7 @@ __all__ = [
     "fuse_likelihood",
     "mean_phasors",
     "phasors",
+    "photon_transfer",
     "radial_to_range",
     "radius_px",
     "range_to_radial",

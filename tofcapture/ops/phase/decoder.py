@@ -19,6 +19,7 @@ from tofcapture.flags import TofFlag
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase.float32 import Correction, Float32, combine, tap_weights, turns_of
 from tofcapture.ops.phase.flying import flying_pixels
+from tofcapture.ops.phase.noise import TapNoise
 from tofcapture.ops.phase.phasor import ambiguity, frequencies
 from tofcapture.ops.phase.unwrapping import whole_ratio
 from tofcapture.rig import RangeError
@@ -27,22 +28,6 @@ _BLOCK = 1 << 16  # pixels; temporaries stay in a core's caches, and calls stay 
 _AMBIGUOUS = 0.25  # wraps of disagreement between the frequencies
 _UNCERTAIN = 0.020  # m, standard deviation from which a pixel is of low confidence
 _UNKNOWN_CELSIUS = 45.0
-
-
-@dataclass(frozen=True)
-class TapNoise:
-    """Noise of one tap of one frame: variance ``tap / electrons_per_unit + read^2`` in raw units squared.
-
-    Attributes
-    ----------
-    electrons_per_unit
-        Photo-electrons per raw unit.
-    read
-        Standard deviation of the electronics, raw units.
-    """
-
-    electrons_per_unit: float = 16.0
-    read: float = 1.25
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,84 @@
+"""Noise of a tap: the model, and its measurement from bursts (photon transfer)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.errors import DataError
+
+_BINS = 48
+_PER_BIN = 50  # taps at least, for a variance worth a point of the line
+_OUTLIER = 30.0  # times the bin's median: hot taps, and whatever moved
+_ROUNDING = 1 / 12  # variance of rounding to whole raw units
+
+
+@dataclass(frozen=True)
+class TapNoise:
+    """Noise of one tap of one frame: variance ``tap / electrons_per_unit + read^2`` in raw units squared.
+
+    Attributes
+    ----------
+    electrons_per_unit
+        Photo-electrons per raw unit.
+    read
+        Standard deviation of the electronics, raw units.
+    """
+
+    electrons_per_unit: float = 16.0
+    read: float = 1.25
+
+
+def photon_transfer(bursts: Iterable[NDArray[np.generic]], saturation: float) -> TapNoise:
+    """Measure the noise of a sensor from bursts of still scenes: the line of variance over mean.
+
+    The shot noise of ``n`` electrons has the variance ``n``, so the slope is the raw units that an electron makes, and what is left in the dark
+    is the electronics' (and less the rounding to whole units, which is not theirs). Taps are sorted into bins of equal number by their mean;
+    the line is weighted by what each bin's variance is worth. Pixels that are noisier than all others of their brightness are left out.
+
+    Parameters
+    ----------
+    bursts
+        Each (frames, ...) raw taps of at least two frames, raw units.
+    saturation
+        Taps that reach it in any frame say nothing of noise.
+
+    Returns
+    -------
+    Infinite electrons per unit where brighter taps are not noisier.
+
+    Raises
+    ------
+    DataError
+        Too few taps that are not saturated.
+    """
+    means, variances = [], []
+    for burst in bursts:
+        taps = np.asarray(burst, dtype=np.float64).reshape(len(burst), -1)
+        if len(taps) < 2:
+            raise DataError(f"photon transfer: expected bursts of two frames at least, got {len(taps)}")
+        below = taps.max(0) < saturation
+        means.append(taps.mean(0)[below])
+        variances.append(taps.var(0, ddof=1)[below])
+    mean, variance = np.concatenate(means or [[]]), np.concatenate(variances or [[]])
+    bins = min(_BINS, len(mean) // _PER_BIN)
+    if bins < 2:
+        raise DataError(
+            f"photon transfer: expected {2 * _PER_BIN} taps below saturation ({saturation:g}), got {len(mean)}",
+            hint="shorten the exposure",
+        )
+    order = np.argsort(mean, kind="stable")
+    points = np.array([_point(mean[part], variance[part]) for part in np.array_split(order, bins)])
+    slope, dark = np.polyfit(points[:, 0], points[:, 1], 1, w=1 / points[:, 1].clip(min=_ROUNDING))
+    gain = 1 / slope if slope > 0 else np.inf
+    floor = dark if slope > 0 else points[:, 1].mean()
+    return TapNoise(float(gain), float(np.sqrt(max(floor - _ROUNDING, 0.0))))
+
+
+def _point(mean: NDArray[np.float64], variance: NDArray[np.float64]) -> tuple[float, float]:
+    """Mean tap and mean variance of a bin, without its outliers."""
+    usual = variance <= _OUTLIER * max(float(np.median(variance)), _ROUNDING)
+    return float(mean[usual].mean()), float(variance[usual].mean())
