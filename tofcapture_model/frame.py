@@ -59,7 +59,7 @@ class Target(NamedTuple):
     Attributes
     ----------
     depth
-        (B, 1, 2H, 2W) float32 metres; finite everywhere, meaningless where ``hit`` is False.
+        (B, 1, 2H, 2W) float32 metres; finite everywhere, meaningless outside ``good`` and ``context``.
     normals
         (B, 3, 2H, 2W) float32, unit, facing the camera.
     good
@@ -82,7 +82,8 @@ class Estimate(NamedTuple):
     depth, normals
         (B, 1, 2H, 2W) metres and (B, 3, 2H, 2W) unit camera-facing, after refinement.
     error
-        (B, 1, 2H, 2W) expected absolute error of the depth, metres, positive.
+        (B, 1, 2H, 2W) how far off the depth may be, metres, positive: its expected absolute error where ``losses.uncertainty`` is ``l1`` (paper), one
+        sigma, within which 68 % of the errors should be, where it is ``laplace`` (compact).
     initial_depth, initial_normals
         The same before refinement.
     """

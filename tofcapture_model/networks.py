@@ -98,7 +98,7 @@ class CompactInputs(nn.Module):
         normals = [plane_normals(c, frame.intrinsics) for c, _ in planes]
         channels = [
             *_phasor_channels(frame.phasor),
-            (frame.depth - 0.8) / 0.4,  # the rig works at 0.35 m to 1.5 m
+            (frame.depth - MIDDLE) / REACH,
             (frame.gap * 10).clamp(-2, 2),  # 20 MHz is noisy by centimetres
             (frame.cues * self.cue_scale * 100).clamp(-2, 2),  # multipath costs up to some cm
             frame.valid,
