@@ -15,12 +15,12 @@ from tofcapture.errors import ConfigError
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.baselines import lf2
 from tofcapture_model.baselines.coarse_fine import CoarseFine
-from tofcapture_model.baselines.guo2018 import MRM, demodulation
+from tofcapture_model.baselines.guo2018 import MRM
 from tofcapture_model.baselines.protocol import Baseline
 from tofcapture_model.baselines.sensor import upsample_depth
 from tofcapture_model.config import BASELINES, Config, Losses, Stage, loads_config, preset
 from tofcapture_model.frame import Target
-from tofcapture_model.geometry import rays, turn, turned_depth
+from tofcapture_model.geometry import metres_per_radian, rays, turn
 from tofcapture_model.zoo import build_model, select_stage, training_loss
 
 
@@ -96,44 +96,115 @@ def test_an_untrained_kernel_network_is_the_sensor(kind):
 
 
 def coherent(data):
-    """Make the phasors those of the raw channels: four phases for each of two frequencies."""
-    c = data.raw
-    iq = [c[:, 0] - c[:, 2], c[:, 3] - c[:, 1], c[:, 4] - c[:, 6], c[:, 7] - c[:, 5]]
-    return data._replace(phasor=torch.stack(iq, 1) / 2)
+    """Make the phasors those of the raw channels."""
+    return data._replace(phasor=torch.einsum("bpc,bchw->bphw", data.demodulation, data.raw))
 
 
-def test_demodulation_is_recovered_from_a_frame():
-    """No order of channels is assumed: the matrix that made the phasors is found again."""
-    data = coherent(frame())
-    matrix = demodulation(data)
-    found = torch.einsum("bpc,bchw->bphw", matrix, data.raw)
-    torch.testing.assert_close(found, data.phasor, atol=1e-5, rtol=0)
-    assert matrix[0, 0].tolist() == pytest.approx([0.5, 0, -0.5, 0, 0, 0, 0, 0], abs=1e-4)
+def turned(phasor, angle):
+    """Phasors (B, 2, H, W) turned by an angle, radians."""
+    i, q = phasor.unbind(1)
+    c, s = torch.as_tensor(angle).cos(), torch.as_tensor(angle).sin()
+    return torch.stack([i * c - q * s, i * s + q * c], 1)
 
 
-def test_turning_a_phasor_moves_the_depth_along_its_ray():
-    """A turn of 0.1 rad at 100 MHz is 23.86 mm of range, less in z at the border."""
+def measured(data, low, high):
+    """Make phasors (B, 2, H, W), and depth and gap what the decoder makes of them alone, without calibration."""
+    metres = [metres_per_radian(data, which) for which in (0, 1)]
+    first, second = (
+        torch.atan2(z[:, 1:], z[:, :1]).remainder(2 * math.pi) * m
+        for z, m in zip((low, high), metres, strict=True)
+    )
+    wrap, full = (2 * math.pi * m for m in reversed(metres))
+    gap = first - second
+    gap = gap - wrap * (gap / wrap).round()
+    lean = data.modulation.square() / data.modulation.square().sum(1, keepdim=True)
+    range_ = (first - lean[:, 1].reshape(-1, 1, 1, 1) * gap).remainder(full)
+    length = rays(data.intrinsics, *data.depth.shape[-2:]).norm(dim=1, keepdim=True)
+    return data._replace(phasor=torch.cat([low, high], 1), depth=range_ / length, gap=gap)
+
+
+def wall(data, depth, noise, seed=0):
+    """Phasors of amplitude 0.1 of a wall, with noise of this standard deviation in I and in Q."""
+    length = rays(data.intrinsics, *data.depth.shape[-2:]).norm(dim=1)
+    phases = [depth * length / metres_per_radian(data, which)[:, 0] for which in (0, 1)]
+    clean = [0.1 * torch.stack([phase.cos(), phase.sin()], 1) for phase in phases]
+    g = torch.Generator().manual_seed(seed)
+    return [z + noise * torch.randn(z.shape, generator=g) for z in clean]
+
+
+def test_turning_both_phasors_moves_the_depth_along_its_ray():
+    """A turn of 0.1 rad at 100 MHz is 23.86 mm of range, less in z at the border; at 20 MHz it is a fifth of the turn."""
     data = frame()
     angle = 0.1
-    i, q = data.phasor[:, 2:].unbind(1)
-    turned = torch.stack(
-        [i * math.cos(angle) - q * math.sin(angle), i * math.sin(angle) + q * math.cos(angle)], 1
-    )
+    low, high = turned(data.phasor[:, :2], angle / 5), turned(data.phasor[:, 2:], angle)
     torch.testing.assert_close(
-        turn(turned, data.phasor[:, 2:]), torch.full_like(data.depth, angle), atol=1e-4, rtol=0
+        turn(high, data.phasor[:, 2:]), torch.full_like(data.depth, angle), atol=1e-4, rtol=0
     )
     length = rays(data.intrinsics, 36, 44).norm(dim=1, keepdim=True)
-    moved = (turned_depth(data, turned) - data.depth) * length
+    depth, gap = lf2.decode(data, low, high)
+    moved = (depth - data.depth) * length
     expected = angle * SPEED_OF_LIGHT / (4 * math.pi * 100e6)
     torch.testing.assert_close(moved, torch.full_like(moved, expected), atol=1e-5, rtol=0)
+    torch.testing.assert_close(gap, data.gap, atol=1e-5, rtol=0)
+
+
+def test_decoding_again_is_decoding():
+    """Whatever the phasors were and are: depth and gap are those of the new phasors alone, and those of the frame where none is new."""
+    data, after = (
+        measured(frame(), *wall(frame(), 2.0, 0.05)),
+        measured(frame(), *wall(frame(), 5.0, 0.05, 1)),
+    )
+    depth, gap = lf2.decode(data, *after.phasor.chunk(2, dim=1))
+    length = rays(data.intrinsics, 36, 44).norm(dim=1, keepdim=True)
+    full = 2 * math.pi * metres_per_radian(data, 0)
+    apart = (depth - after.depth) * length / full
+    assert (apart - apart.round()).abs().max() < 1e-5  # in ranges of the low frequency
+    torch.testing.assert_close(gap, after.gap, atol=1e-4, rtol=0)
+    assert torch.equal(lf2.decode(data, *data.phasor.chunk(2, dim=1))[0], data.depth)
+
+
+def test_a_hole_keeps_its_wraps():
+    """Its gap says nothing of the depth that was filled in."""
+    data = frame()
+    data = data._replace(valid=torch.zeros_like(data.valid), gap=torch.full_like(data.gap, 0.76))
+    assert torch.equal(lf2.decode(data, *data.phasor.chunk(2, dim=1))[0], data.depth)
 
 
 def test_a_dark_pixel_has_a_finite_gradient():
     """atan2 at zero would give NaN, which one dark pixel would spread over all weights."""
     data = frame(batch=1)
-    high = torch.zeros_like(data.phasor[:, 2:]).requires_grad_()
-    turned_depth(data, high).sum().backward()
-    assert torch.isfinite(high.grad).all()
+    phasor = torch.zeros_like(data.phasor).requires_grad_()
+    lf2.decode(data, *phasor.chunk(2, dim=1))[0].sum().backward()
+    assert torch.isfinite(phasor.grad).all()
+
+
+def test_the_kernel_network_decodes_both_frequencies():
+    """All 64 entries of the mixing matrix move the depth."""
+    data = coherent(frame(batch=1))
+    model = build_model(preset("guo2018"))
+    kernels = torch.eye(8).reshape(1, 8, 8, 1, 1).repeat(1, 1, 1, 36, 44).requires_grad_()
+    model.kernels = lambda _: kernels
+    model.estimate_depth(data).sum().backward()
+    assert (kernels.grad.abs().sum((0, 3, 4)) > 1e-3).all()
+
+
+def test_the_kernel_network_can_correct_a_wrap():
+    """The low frequency says 1 m too much, so the wrap is wrong; a mixing that turns it back moves the depth by 1.5 m."""
+    data = frame(batch=1)
+    low, high = wall(data, 0.9, 0.003)
+    error = 1 / metres_per_radian(data, 0).squeeze()
+    right, data = measured(data, low, high), measured(data, turned(low, error), high)
+    assert (data.depth - right.depth).min() > 1.0
+    rows = torch.zeros(4, 8)
+    for row, (plus, minus) in enumerate(((0, 2), (3, 1), (4, 6), (7, 5))):
+        rows[row, plus], rows[row, minus] = 0.5, -0.5
+    data = data._replace(raw=0.5 + 2 * torch.einsum("pc,bphw->bchw", rows, data.phasor))
+    back = torch.eye(4)
+    back[:2, :2] = turned(torch.eye(2)[None, :, :, None], -error)[0, :, :, 0]
+    mixing = torch.eye(8) + 2 * rows.T @ (back - torch.eye(4)) @ rows
+    model = build_model(preset("guo2018"))
+    model.kernels = lambda _: mixing.T.reshape(1, 8, 8, 1, 1).expand(1, 8, 8, 36, 44)
+    torch.testing.assert_close(model.estimate_depth(data), right.depth, atol=1e-3, rtol=0)
 
 
 def test_the_classical_filter_quietens_a_noisy_plane_and_gives_up_what_flies():
@@ -150,6 +221,66 @@ def test_the_classical_filter_quietens_a_noisy_plane_and_gives_up_what_flies():
     assert (found - 0.8).abs().mean() < 0.5 * (upsample_depth(depth) - 0.8).abs().mean()
     assert normals.shape == (1, 3, 72, 88)
     assert not lf2.estimate(data._replace(phasor=1e-5 * data.phasor))[2].any()
+
+
+def test_the_classical_filter_mends_wraps():
+    """Of a noisy wall some pixels alone are decoded a wrap off, below zero too: filtered phasors put nearly all of them right."""
+    data = frame(h=90, w=110, batch=1)
+    data = data._replace(intrinsics=data.intrinsics * 2.5)
+    data = measured(data, *wall(data, 0.9, 0.025))
+    wrong = (data.depth - 0.9).abs() > 0.5
+    assert wrong.sum() > 50
+    assert (data.depth > 5).any()
+    found, _, _ = lf2.estimate(data)
+    assert ((found - 0.9).abs() > 0.5).float().mean() < 0.1 * wrong.float().mean()
+
+
+def test_a_hole_keeps_its_filling_through_the_filter():
+    """Its phasor is that of a saturated or a dark pixel, and turns to its neighbours' for nothing."""
+    data = frame(batch=1)
+    data = measured(data, *wall(data, 0.9, 0.0))
+    data.phasor[:, 2:, 18, 22] = turned(data.phasor[:, 2:], 1.0)[..., 18, 22]
+    data.valid[..., 18, 22] = 0
+    found, _, kept = lf2.estimate(data)
+    torch.testing.assert_close(found, torch.full_like(found, 0.9), atol=1e-2, rtol=0)
+    assert not kept[..., 36:38, 44:46].any()
+
+
+def test_frequencies_that_disagree_are_given_up():
+    """A gap of 0.5 m is a residual of 0.41 rad: too much at a large amplitude (0.35 rad), noise at a small one (up to 0.61 rad)."""
+    data = frame(batch=1)
+    low, high = wall(data, 0.9, 0.0)
+    error = 0.5 / float(metres_per_radian(data, 0))
+    for amplitude, keeps in ((0.4, False), (0.02, True)):
+        data = measured(data, *(amplitude / 0.1 * z for z in (turned(low, error), high)))
+        torch.testing.assert_close(data.gap, torch.full_like(data.gap, 0.5), atol=1e-4, rtol=0)
+        assert lf2.estimate(data)[2].all() == keeps
+        assert lf2.estimate(data)[2].any() == keeps
+    agreeing = measured(data, *(4 * z for z in (low, high)))
+    assert lf2.estimate(agreeing)[2].all()
+
+
+@pytest.mark.parametrize(
+    ("below", "above", "flies"),
+    [(0.06, 0.06, False), (0.11, 0.04, True), (0.06, 0.11, True), (0.11, 0.02, False), (0.04, 0.11, False)],
+)
+def test_one_step_of_an_edge_is_a_large_one(below, above, flies):
+    """More than 50 mm to the nearest neighbour, 30 mm to the farthest, and one of both above 100 mm."""
+    depth = torch.full((1, 1, 5, 5), 1.0)
+    depth[..., :2, :], depth[..., 3:, :] = 1 - below, 1 + above
+    amplitude = torch.linspace(0.1, 0.3, 5).expand(1, 1, 5, 5)
+    assert bool(lf2.flying(depth, amplitude)[..., 2, 2]) == flies
+
+
+def test_a_phase_unlike_its_neighbours_is_an_edge():
+    """At either frequency, whatever depth and amplitude are."""
+    data = frame(batch=1)
+    data = measured(data, *wall(data, 0.9, 0.0))
+    odd = data.phasor.clone()
+    odd[:, :2, 18, 22] = turned(odd[:, :2], 2.0)[:, :, 18, 22]
+    kept = lf2.estimate(data._replace(phasor=odd))[2]
+    assert not kept[..., 36:38, 44:46].any()
+    assert kept.sum() == kept.numel() - 4
 
 
 def test_a_baseline_has_one_stage():

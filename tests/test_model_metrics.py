@@ -33,13 +33,14 @@ MASK = RNG.random(GT.shape) > [[[0.2]], [[0.9]]]
 
 
 def test_depth_columns_are_their_definitions():
-    """ABS, SQ, RMSE, MAE, median, within and delta agree with numpy over the mask."""
+    """ABS, SQ, RMSE, RMSE of logarithms, MAE, median, within and delta agree with numpy over the mask."""
     found = score(DEPTH, GT, MASK)["depth"]["pixel"]
     e, g = (DEPTH - GT)[MASK], GT[MASK]
     expected = {
         "abs": (abs(e) / g).mean(),
         "sq": (e**2 / g).mean(),
         "rmse": math.sqrt((e**2).mean()),
+        "rmse_log": math.sqrt(np.mean((np.log10(DEPTH[MASK]) - np.log10(g)) ** 2)) * math.log(10),
         "mae": abs(e).mean(),
         "bias": e.mean(),
         "within_10mm": (abs(e) < 0.01).mean(),
@@ -89,6 +90,8 @@ def test_normal_columns_count_angles():
     assert table["within_11.25deg"] == pytest.approx(2 / 3)
     assert table["paper_bad20_pct"] == pytest.approx(100 / 3)
     assert table["paper_normal_mae"] == pytest.approx(math.radians(70 / 3), abs=1e-5)
+    assert table["one_minus_cos"] == pytest.approx((1 - np.cos(tilts)).mean(), rel=1e-5)
+    assert table["comp_mae"] == pytest.approx((np.sin(tilts) + 1 - np.cos(tilts)).mean() / 3, rel=1e-5)
 
 
 def test_small_angles_are_exact():
@@ -104,6 +107,43 @@ def test_coverage_counts_what_the_method_measured_itself():
     found = score(DEPTH, GT, MASK, measured=measured)["depth"]["pixel"]
     assert found["coverage"] == pytest.approx(measured.sum() / MASK.sum())
     assert found["pixels"] == MASK.sum()
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_what_has_no_answer_is_refused_and_counted(wrong):
+    """A depth or a normal that is not finite, and a normal of length zero, change no mean: they cost coverage and are told."""
+    lost = MASK & (RNG.random(MASK.shape) < 0.3)
+    up = np.broadcast_to(np.array([0.1, 0, -1])[None, :, None, None], (2, 3, 20, 30))
+    rest = score(DEPTH, GT, MASK & ~lost, normals=up)
+    bad_normals = np.where(lost[:, None] & (np.arange(3) == 1)[None, :, None, None], wrong, up)
+    for depth, normals in (
+        (np.where(lost, wrong, DEPTH), up),
+        (DEPTH, bad_normals),
+        (DEPTH, np.where(lost[:, None], 0, up)),
+    ):
+        found = score(depth, GT, MASK, normals=normals)
+        for part in ("depth", "normal"):
+            row, same = found[part]["pixel"], rest[part]["pixel"]
+            assert row["refused"] == lost.sum()
+            assert row["coverage"] == pytest.approx(1 - lost.sum() / MASK.sum())
+            for key in same.keys() - {"refused", "coverage"}:
+                assert row[key] == pytest.approx(same[key], rel=1e-9, abs=1e-12), key
+
+
+def test_no_answer_at_all_is_no_number():
+    """A method that diverged covers nothing."""
+    assert score(np.full_like(DEPTH, np.nan), GT, MASK)["depth"]["pixel"] == {
+        "pixels": 0,
+        "coverage": 0.0,
+        "refused": MASK.sum(),
+    }
+
+
+def test_a_depth_behind_the_camera_is_never_within_a_ratio():
+    """Its ratio is below every threshold; its logarithm is that of a millimetre."""
+    found = score(-GT, GT, MASK)["depth"]["pixel"]
+    assert [found[f"delta_{k}"] for k in (1, 2, 3)] == [0, 0, 0]
+    assert found["rmse_log"] == pytest.approx(math.sqrt((np.log(GT[MASK] / 1e-3) ** 2).mean()), rel=1e-5)
 
 
 def test_nothing_to_measure_is_said_and_not_invented():

@@ -34,6 +34,12 @@ TINY_PAPER = Network(width=2, levels=3, refine_iterations=1)
 TINY_COMPACT = replace(preset("demo").network, width=4, levels=2, refine_iterations=1)
 
 
+def four_phases():
+    """(4, 8) matrix of I and Q of two frequencies, each at 0, 90, 180, 270 degrees."""
+    pair = torch.tensor([[0.5, 0, -0.5, 0], [0, -0.5, 0, 0.5]])
+    return torch.block_diag(pair, pair)
+
+
 def frame(h=36, w=44, batch=2, seed=0):
     """A frame of random numbers that could be one."""
     g = torch.Generator().manual_seed(seed)
@@ -49,7 +55,7 @@ def frame(h=36, w=44, batch=2, seed=0):
         cues=0.01 * torch.randn(batch, 4, h, w, generator=g),
         modulation=torch.tensor([[20e6, 100e6]]).expand(batch, 2),
         intrinsics=k,
-        demodulation=torch.zeros(batch, 4, 8),
+        demodulation=four_phases().expand(batch, 4, 8),
     )
 
 

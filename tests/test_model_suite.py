@@ -25,6 +25,8 @@ from tofcapture.files.cache import pack
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.checkpoint import load_model
 from tofcapture_model.config import Losses, Stage, preset, presets
+from tofcapture_model.data import make_target
+from tofcapture_model.geometry import rays, scale_intrinsics
 from tofcapture_model.losses import error_map_loss, laplace_loss, reweighting
 from tofcapture_model.measures import Precision, Uncertainty, regions
 from tofcapture_model.predict import predict
@@ -192,6 +194,87 @@ def test_precision_is_the_spread_of_a_pixel_over_the_shots():
     shots.add(torch.ones(2))
     shots.close()
     assert shots.views == 1
+
+
+def test_shots_without_an_answer_are_left_out():
+    """A pixel that one shot lacks has no spread, and an error that is not finite no place in the order."""
+    shots, nan = Precision(), torch.nan
+    for row in ([1.0, 2.0, nan], [1.2, nan, 3.0]):
+        shots.add(torch.tensor(row))
+    shots.close()
+    assert shots.row()["precision"] == pytest.approx(0.2 / 2**0.5, rel=1e-5)
+    for _ in range(2):
+        shots.add(torch.full((3,), nan))
+    shots.close()
+    assert shots.views == 1
+    error = torch.rand(100, generator=torch.Generator().manual_seed(0))
+    some, all_ = Uncertainty(), Uncertainty()
+    some.add(error, 1 - error)
+    all_.add(torch.cat([torch.tensor([nan, 0.1]), error]), torch.cat([torch.tensor([0.1, nan]), 1 - error]))
+    assert all_ == some
+
+
+def surface(tilt, step=0.0, masked=0, missing=0, rough=0.0):
+    """A frame and its ground truth: a plane 1.2 m ahead, tilted about y; right of the middle another, ``step`` behind it.
+
+    ``masked`` and ``missing`` pixels on either side of the step are neither good nor context, or without depth.
+    """
+    data = frame(90, 120, batch=1)._replace(intrinsics=torch.tensor([[190.0, 200.0, 59.5, 44.5]]))
+    r = rays(scale_intrinsics(data.intrinsics, 2), 180, 240)[0].double().permute(1, 2, 0).numpy()
+    normal = np.array([np.sin(np.radians(tilt)), 0, -np.cos(np.radians(tilt))])
+    right = np.arange(240)[None, :] >= 120
+    depth = (1.2 * normal[2] - step * right) / (r @ normal)
+    if (
+        rough
+    ):  # m; towards the viewer and away in turns along the columns, by a tenth of a degree of slope or so
+        depth = depth + rough * np.sin(np.arange(240) / 20)
+    near = np.minimum(abs(np.arange(240) - 119), abs(np.arange(240) - 120))[None, :] + np.zeros((180, 1), int)
+    depth = np.where(near < missing, np.nan, depth).astype(np.float32)
+    mask = np.where(np.isnan(depth), 1, np.where(near < masked, 8, 0)).astype(np.uint8)
+    normals = np.broadcast_to(normal, (180, 240, 3)).astype(np.float32)
+    return data, type(target(data))(*(x[None] for x in make_target(depth, normals, mask)))
+
+
+@pytest.mark.parametrize("tilt", [0, 50, 60, 75])
+def test_a_slanted_plane_has_no_edge(tilt):
+    """However much its depth changes within the band."""
+    found = regions(*surface(tilt, rough=0.0005))
+    assert found["all"].all()
+    assert not found["edge"].any()
+
+
+@pytest.mark.parametrize("step", [0.031, -0.031, 0.2])
+@pytest.mark.parametrize("tilt", [0, 50, -50])
+def test_a_step_of_3_cm_is_an_edge_of_5_px_on_either_side(tilt, step):
+    """Seen from the front or on a slope, its rim good or masked; half of it is none."""
+    band = torch.zeros(240, dtype=torch.bool)
+    band[115:125] = True
+    for masked in (0, 2, 3):
+        data, truth = surface(tilt, step, masked)
+        assert torch.equal(regions(data, truth)["edge"], truth.good & band)
+    assert not regions(*surface(tilt, step=0.015))["edge"].any()
+
+
+@pytest.mark.parametrize("tilt", [0, 50])
+@pytest.mark.parametrize("missing", [1, 2])
+def test_a_step_across_missing_ground_truth_is_an_edge(tilt, missing):
+    """Up to five pixels without depth may lie between both sides; without a step they are no edge."""
+    data, truth = surface(tilt, 0.05, masked=missing + 1, missing=missing)
+    found = regions(data, truth)["edge"]
+    assert found[0, 0, :, 115:125].equal(truth.good[0, 0, :, 115:125])
+    assert not found[..., :114].any()
+    assert not found[..., 126:].any()
+    assert not regions(*surface(tilt, 0.0, masked=missing + 1, missing=missing))["edge"].any()
+
+
+def test_a_crease_is_no_edge():
+    """Two walls that meet at a right angle, seen 4 m away: neighbours are off each other's planes by less than a step."""
+    data, truth = surface(45)
+    left = torch.arange(240) < 120
+    depth = torch.where(left, truth.depth.flip(-1), truth.depth) / 1.2 * 4
+    mirrored = truth.normals * torch.tensor([-1.0, 1, 1]).reshape(1, 3, 1, 1)
+    walls = truth._replace(depth=depth, normals=torch.where(left, mirrored, truth.normals))
+    assert not regions(data, walls)["edge"].any()
 
 
 def test_regions_split_the_good_pixels():

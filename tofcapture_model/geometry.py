@@ -266,16 +266,6 @@ def turn(new: Tensor, old: Tensor) -> Tensor:
     return torch.atan2(imaginary, real + torch.where(real < 0, -_FAINT, _FAINT))
 
 
-def turned_depth(frame: Frame, high: Tensor) -> Tensor:
-    """Depth (B, 1, H, W), metres, that the frame would have had with ``high`` (B, 2, H, W) as its phasor of the high frequency.
-
-    The phasor's turn moves the decoded depth along the ray: calibration and unwrapping stay those of the frame.
-    """
-    radial = turn(high, frame.phasor[:, 2:]) * metres_per_radian(frame, 1)
-    length = rays(frame.intrinsics, *frame.depth.shape[-2:]).square().sum(1, keepdim=True).sqrt()
-    return frame.depth + radial / length
-
-
 def metres_per_radian(frame: Frame, which: int) -> Tensor:
     """(B, 1, 1, 1) range per phase of the low (0) or the high (1) frequency."""
     return (SPEED_OF_LIGHT / (4 * math.pi)) / frame.modulation[:, which].reshape(-1, 1, 1, 1)

@@ -1,7 +1,11 @@
 """Depth and normal metrics as sums and counts, so that they add over batches, views and processes.
 
+A pixel without an answer (depth or normal not finite, or a normal of length zero) is in no mean: it is not covered, and
+counted as ``refused``.
+
 ``pixel`` pools all pixels, ``image`` averages the value of every image; both are reported, because they differ as soon as
-masks do. Lengths are metres, keys that end in ``_deg`` degrees, in ``_pct`` percent; fractions are in [0, 1].
+masks do. Lengths are metres, keys that end in ``_deg`` degrees, in ``_pct`` percent; fractions are in [0, 1];
+``rmse_log`` (natural logarithm), ``one_minus_cos`` and ``comp_mae`` have no unit.
 """
 
 from __future__ import annotations
@@ -18,21 +22,24 @@ Row = dict[str, float]
 _DEPTH_BIN = 1e-4  # m; medians are exact to half of it
 _ANGLE_BIN = 0.01  # deg
 _BINS = 20_000  # 2 m, 200 deg
+_LEAST = 1e-3  # m; the logarithm of a depth below is that of a millimetre
 
 DEPTH_TERMS: Mapping[str, Callable[[Tensor, Tensor], Tensor]] = {
     "abs": lambda d, g: (d - g).abs() / g,
     "sq": lambda d, g: (d - g).square() / g,
     "square": lambda d, g: (d - g).square(),
+    "square_log": lambda d, g: (d.clamp_min(_LEAST) / g).log().square(),
     "mae": lambda d, g: (d - g).abs(),
     "bias": lambda d, g: d - g,
     **{f"within_{mm}mm": lambda d, g, t=mm / 1000: ((d - g).abs() < t).double() for mm in (5, 10, 20, 50)},  # type: ignore[misc]
-    **{f"delta_{k}": lambda d, g, t=1.25**k: (torch.maximum(d / g, g / d) < t).double() for k in (1, 2, 3)},  # type: ignore[misc]
+    **{f"delta_{k}": lambda d, g, t=1.25**k: ((d < t * g) & (t * d > g)).double() for k in (1, 2, 3)},  # type: ignore[misc]
 }
 """Per-pixel terms of predicted depth and ground truth, float64 metres; each column of the table is a mean of one."""
 
 ANGLE_TERMS: Mapping[str, Callable[[Tensor], Tensor]] = {
     "mean_deg": lambda a: a,
     "square": lambda a: a.square(),
+    "one_minus_cos": lambda a: 2 * torch.deg2rad(a / 2).sin().square(),
     **{f"within_{t:g}deg": lambda a, t=t: (a < t).double() for t in (5, 7.5, 11.25, 20, 22.5, 30)},  # type: ignore[misc]
 }
 """Per-pixel terms of the angle between normals, degrees."""
@@ -43,6 +50,12 @@ def angles_deg(normals: Tensor, gt: Tensor) -> Tensor:
     a, b = normals.double(), gt.double()
     cross = torch.linalg.cross(a, b, dim=-2).norm(dim=-2)
     return torch.rad2deg(torch.atan2(cross, (a * b).sum(-2)))
+
+
+def component_error(normals: Tensor, gt: Tensor) -> Tensor:
+    """Mean absolute difference (..., N) of the components of (..., 3, N) vectors of any length, once they are unit."""
+    a, b = (torch.nn.functional.normalize(x.double(), dim=-2) for x in (normals, gt))
+    return (a - b).abs().mean(-2)
 
 
 @dataclass
@@ -56,9 +69,9 @@ class Pool:
     image_sums, images
         Over images with at least one pixel.
     histogram
-        (bins,) counts of the value whose median is asked for.
-    measured, wanted
-        Pixels that the method covers, and pixels of the mask.
+        (bins,) counts of the value whose median is asked for, in the host's memory.
+    measured, refused, wanted
+        Pixels that the method covers, pixels without an answer, and pixels of the mask.
     """
 
     sums: dict[str, float] = field(default_factory=dict)
@@ -67,6 +80,7 @@ class Pool:
     images: int = 0
     histogram: Tensor = field(default_factory=lambda: torch.zeros(_BINS, dtype=torch.float64))
     measured: int = 0
+    refused: int = 0
     wanted: int = 0
 
     def add(
@@ -80,20 +94,20 @@ class Pool:
         self.sums = {k: self.sums.get(k, 0.0) + v for k, v in sums.items()}
         self.image_rows = {k: self.image_rows.get(k, 0.0) + v for k, v in row.items()}
         self.count, self.images = self.count + len(values), self.images + 1
-        self.histogram += torch.bincount(
-            (values / width).long().clamp_max(_BINS - 1), minlength=_BINS
-        ).double()
+        counts = torch.bincount((values / width).long().clamp_max(_BINS - 1), minlength=_BINS)
+        self.histogram += counts.cpu()
 
     def means(self, width: float, finish: Callable[[Row], Row]) -> dict[str, Row]:
         """Both poolings of every column, and how much they stand on."""
         if self.count == 0:
-            return {"pixel": {"pixels": 0}, "image": {"images": 0}}
+            none = {"coverage": 0.0, "refused": self.refused} if self.refused else {}
+            return {"pixel": {"pixels": 0, **none}, "image": {"images": 0, **none}}
         pixel = finish({k: v / self.count for k, v in self.sums.items()} | {"median": self._median(width)})
         image = {k: v / self.images for k, v in self.image_rows.items()}
-        coverage = self.measured / max(self.wanted, 1)
+        told = {"coverage": self.measured / max(self.wanted, 1), "refused": self.refused}
         return {
-            "pixel": pixel | {"pixels": self.count, "coverage": coverage},
-            "image": image | {"images": self.images, "coverage": coverage},
+            "pixel": pixel | {"pixels": self.count, **told},
+            "image": image | {"images": self.images, **told},
         }
 
     def _median(self, width: float) -> float:
@@ -102,6 +116,7 @@ class Pool:
 
 def _finish_depth(row: Row) -> Row:
     row["rmse"] = math.sqrt(row.pop("square"))
+    row["rmse_log"] = math.sqrt(row.pop("square_log"))
     return row
 
 
@@ -143,18 +158,22 @@ class Score:
             (B, 1, H, W) bool: where the method answers by itself, and not by a neighbour; only counted, as coverage.
         """
         for d, n, gd, gn, m, seen in zip(depth, normals, gt_depth, gt_normals, mask, measured, strict=True):
-            at = m[0]
+            answered = d[0].isfinite() & n.isfinite().all(0) & (n != 0).any(0)
+            at = m[0] & answered
             self._add_image(d[0][at].double(), n[:, at], gd[0][at].double(), gn[:, at])
+            wanted, answers, measures = (int(x.sum()) for x in (m[0], at, at & seen[0]))
             for pool in (self.depth, self.normal):
-                pool.wanted += int(at.sum())
-                pool.measured += int((at & seen[0]).sum())
+                pool.wanted += wanted
+                pool.refused += wanted - answers
+                pool.measured += measures
 
     def _add_image(self, d: Tensor, n: Tensor, gd: Tensor, gn: Tensor) -> None:
         self.depth.add(
             {k: term(d, gd) for k, term in DEPTH_TERMS.items()}, (d - gd).abs(), _DEPTH_BIN, _finish_depth
         )
         angle = angles_deg(n, gn)
-        self.normal.add({k: term(angle) for k, term in ANGLE_TERMS.items()}, angle, _ANGLE_BIN, _finish_angle)
+        terms = {k: term(angle) for k, term in ANGLE_TERMS.items()} | {"comp_mae": component_error(n, gn)}
+        self.normal.add(terms, angle, _ANGLE_BIN, _finish_angle)
 
     def table(self) -> dict[str, dict[str, Row]]:
         """``{"depth": {"pixel": {...}, "image": {...}}, "normal": {...}}``."""

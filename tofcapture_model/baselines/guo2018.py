@@ -1,7 +1,8 @@
 """MRM of FLAT: Guo, Frosio, Gallo, Zickler, Kautz, "Tackling 3D ToF Artifacts Through Learning and the FLAT Dataset", ECCV 2018.
 
 A kernel-predicting network mixes the raw channels of every pixel into corrected ones, which the camera's own arithmetic then
-decodes; the loss is on the depth, so the decoding is differentiable. Its flow module (MOM) is for moving scenes and is left out.
+decodes, both frequencies and unwrapping included; the loss is on the depth, so the decoding is differentiable. Its flow module (MOM)
+is for moving scenes and is left out.
 """
 
 from __future__ import annotations
@@ -10,9 +11,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
+from tofcapture_model.baselines import lf2
 from tofcapture_model.baselines.protocol import Baseline
 from tofcapture_model.frame import Estimate, Frame, Target, expect_channels
-from tofcapture_model.geometry import turned_depth
 from tofcapture_model.losses import masked_mean
 from tofcapture_model.unet import pad_to_multiple
 
@@ -71,13 +72,13 @@ class MRM(Baseline):
         nn.init.zeros_(self.head[-1].weight)  # type: ignore[arg-type]
 
     def estimate_depth(self, frame: Frame) -> Tensor:
-        """Decode the mixed channels relative to the frame's own decoding, calibration and unwrapping included."""
+        """Decode the mixed channels of both frequencies, relative to the frame's own decoding: calibration stays the camera's."""
         expect_channels(frame.raw, self.channels, "guo2018")
         kernels = self.kernels(frame.raw).float()
         with torch.autocast(frame.raw.device.type, enabled=False):
             mixed = torch.einsum("bcihw,bchw->bihw", kernels, frame.raw)
-            high = torch.einsum("bpc,bchw->bphw", demodulation(frame), mixed)[:, 2:]
-        return turned_depth(frame, high)
+            low, high = torch.einsum("bpc,bchw->bphw", frame.demodulation, mixed).chunk(2, dim=1)
+        return lf2.decode(frame, low, high)[0]
 
     def kernels(self, raw: Tensor) -> Tensor:
         """(B, C, C, H, W) mixing matrices about the identity: an untrained network changes nothing."""
@@ -105,15 +106,6 @@ class MRM(Baseline):
         """Root mean square error over the mask, metres."""
         del frame
         return (masked_mean((estimate.depth - target.depth).square(), target.good) + 1e-12).sqrt()
-
-
-def demodulation(frame: Frame) -> Tensor:
-    """(B, 4, C) matrix that makes phasors of raw channels, recovered from the frame: no order of channels is assumed."""
-    raw, phasor = frame.raw.flatten(2).double(), frame.phasor.flatten(2).double()
-    gram = raw @ raw.mT
-    ridge = 1e-9 * gram.diagonal(dim1=1, dim2=2).mean(1).reshape(-1, 1, 1)
-    eye = torch.eye(raw.shape[1], dtype=raw.dtype, device=raw.device)
-    return torch.linalg.solve(gram + ridge * eye, raw @ phasor.mT).mT.float()  # type: ignore[no-any-return]
 
 
 def _initialise(module: nn.Module) -> None:

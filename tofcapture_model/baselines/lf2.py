@@ -1,10 +1,12 @@
 """LF2 for two frequencies: the classical pipeline of libfreenect2's decoder, which Guo 2018 compares with; nothing is learned.
 
-Joint bilateral filter of the phasors, decoding, edge filter. Unwrapping and calibration are those of the frame: the filtered phasor
-turns the decoded range by its change of phase, low amplitudes and edges that fly are given up.
+Joint bilateral filter of the phasors, unwrapping of what it yields, rejection by residual, depth, edge filter. Calibration is that of
+the frame: the filtered phasors turn its ranges by their change of phase. Low amplitudes, frequencies that disagree and edges are given up.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
@@ -13,13 +15,24 @@ from torch.nn import functional as F  # noqa: N812
 from tofcapture_model.baselines.protocol import NEAREST, NORMAL_RADIUS
 from tofcapture_model.baselines.sensor import upsample_depth
 from tofcapture_model.frame import Frame
-from tofcapture_model.geometry import depth_to_normals, scale_intrinsics, shifted, turned_depth
+from tofcapture_model.geometry import (
+    depth_to_normals,
+    metres_per_radian,
+    rays,
+    scale_intrinsics,
+    shifted,
+    turn,
+)
 
 GAUSSIAN = (0.1070, 0.1131, 0.1070, 0.1131, 0.1196, 0.1131, 0.1070, 0.1131, 0.1070)
 RANGE = 1.442695 * 5.0  # of the phase distance (1 - cos) / 2
 _FAINT = 1e-3  # of saturation: below it a neighbour has no say
 _ROUGH = 0.05  # standard deviation over mean of the amplitude, from which a pixel may be an edge
-_BELOW, _ABOVE, _STEP = 0.050, 0.030, 0.100  # m: to the nearest, to the farthest neighbour, and both together
+_BELOW, _ABOVE, _STEP = 0.050, 0.030, 0.100  # m: to the nearest, to the farthest neighbour, larger of both
+_APART = 2.5  # sum of phase distances to the eight neighbours, from which a pixel is an edge
+_COUNTS = 3 / _FAINT  # amplitude of 1 in raw units of Kinect v2, whose faintest is 3
+_RESIDUAL = (20 * math.pi / 180, 35 * math.pi / 180)  # rad, tolerated at large and at small amplitudes
+_SLOPE, _OFFSET = -0.5330578, 0.7694894 * math.log2(10)  # ln of the tolerated residual over ln of counts
 
 
 def estimate(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
@@ -34,11 +47,13 @@ def estimate(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
     measured
         (B, 1, 2H, 2W) bool.
     """
-    low, high = (bilateral(z) for z in frame.phasor.chunk(2, dim=1))
-    depth = turned_depth(frame, high).clamp_min(NEAREST)
-    amplitude = high.square().sum(1, keepdim=True).sqrt()
-    dark = (amplitude < _FAINT) | (low.square().sum(1, keepdim=True).sqrt() < _FAINT)
-    kept = (frame.valid > 0) & ~dark & ~flying(depth, amplitude)
+    (low, low_apart), (high, high_apart) = (bilateral(z) for z in frame.phasor.chunk(2, dim=1))
+    depth, gap = decode(frame, low, high)
+    depth = torch.where(frame.valid > 0, depth, frame.depth).clamp_min(NEAREST)
+    faint, amplitude = (z.square().sum(1, keepdim=True).sqrt() for z in (low, high))
+    dark = torch.minimum(faint, amplitude) < _FAINT
+    edge = flying(depth, amplitude) | (torch.maximum(low_apart, high_apart) >= _APART)
+    kept = (frame.valid > 0) & ~dark & ~edge & ~disagreeing(frame, gap, torch.maximum(faint, amplitude))
     depth = upsample_depth(depth)
     normals = depth_to_normals(
         depth, torch.ones_like(depth), scale_intrinsics(frame.intrinsics, 2), NORMAL_RADIUS
@@ -46,17 +61,63 @@ def estimate(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
     return depth, normals, F.interpolate(kept.float(), scale_factor=2, mode="nearest") > 0
 
 
-def bilateral(phasor: Tensor) -> Tensor:
-    """Mean of the 3 x 3 phasors (B, 2, H, W), weighted by distance and by agreement in phase."""
+def decode(frame: Frame, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Decode a frame again with other phasors, differentiably: both frequencies, unwrapped and fused as the decoder does.
+
+    Their turns move the ranges, so calibration stays that of the frame; the wrap is the one that leaves the smallest gap. Rounding
+    has no gradient. Holes turn, but their wraps stay: no gap is known there.
+
+    Parameters
+    ----------
+    frame
+        Decoded from ``frame.phasor``.
+    low, high
+        (B, 2, H, W) phasors of the low and the high frequency.
+
+    Returns
+    -------
+    depth
+        (B, 1, H, W) metres, ``frame.depth`` where the phasors are the frame's.
+    gap
+        (B, 1, H, W) metres, range of the low minus range of the high frequency, within half a range of the high one but in holes.
+    """
+    low_metres, high_metres = metres_per_radian(frame, 0), metres_per_radian(frame, 1)
+    low_range, high_range = 2 * math.pi * low_metres, 2 * math.pi * high_metres
+    lean = high_metres.square() / (low_metres.square() + high_metres.square())  # f^2: inverse variance
+    turned = turn(high, frame.phasor[:, 2:]) * high_metres
+    gap = frame.gap + turn(low, frame.phasor[:, :2]) * low_metres - turned
+    wraps = frame.valid * high_range * torch.round(gap / high_range)
+    gap = gap - wraps
+    length = rays(frame.intrinsics, *frame.depth.shape[-2:]).square().sum(1, keepdim=True).sqrt()
+    # the decoder's ranges lie within that of the low frequency
+    rounds = low_range * torch.floor((frame.depth * length + wraps) / low_range)
+    moved = turned + wraps - frame.valid * rounds + lean * (gap - frame.gap)
+    return frame.depth + moved / length, gap
+
+
+def disagreeing(frame: Frame, gap: Tensor, amplitude: Tensor) -> Tensor:
+    """(B, 1, H, W) bool: phases further from those of any range than LF2 tolerates at this amplitude, the larger of the two.
+
+    The residual is the distance, in radians, of the two unwrapped phases from the line along which they grow with the range.
+    """
+    residual = gap.abs() / torch.hypot(metres_per_radian(frame, 0), metres_per_radian(frame, 1))
+    tolerated = torch.exp(_SLOPE * (_COUNTS * amplitude).clamp_min(1e-9).log() + _OFFSET)
+    return residual > tolerated.clamp(*_RESIDUAL)
+
+
+def bilateral(phasor: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean of the 3 x 3 phasors (B, 2, H, W), weighted by distance and by agreement in phase; (B, 1, H, W) sum of phase distances."""
     amplitude = phasor.square().sum(1, keepdim=True).sqrt()
     direction = phasor / amplitude.clamp_min(1e-9)
-    total, weights = torch.zeros_like(phasor), torch.zeros_like(amplitude)
+    total, weights, distance = (torch.zeros_like(x) for x in (phasor, amplitude, amplitude))
     for k, share in enumerate(GAUSSIAN):
         dy, dx = k // 3 - 1, k % 3 - 1
         apart = (1 - (shifted(direction, dy, dx) * direction).sum(1, keepdim=True)) / 2
-        weight = share * torch.exp(-RANGE * apart) * (shifted(amplitude, dy, dx) >= _FAINT)
+        heard = shifted(amplitude, dy, dx) >= _FAINT
+        weight = share * torch.exp(-RANGE * apart) * heard
+        distance = distance + apart * heard
         total, weights = total + weight * shifted(phasor, dy, dx), weights + weight
-    return torch.where(weights > 0, total / weights.clamp_min(1e-9), phasor)
+    return torch.where(weights > 0, total / weights.clamp_min(1e-9), phasor), distance
 
 
 def flying(depth: Tensor, amplitude: Tensor) -> Tensor:
@@ -64,6 +125,6 @@ def flying(depth: Tensor, amplitude: Tensor) -> Tensor:
     around = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     a = torch.cat([shifted(amplitude, *s) for s in around], dim=1)
     d = torch.cat([shifted(depth, *s) for s in around], dim=1)
-    rough = a.std(1, keepdim=True) >= _ROUGH * a.mean(1, keepdim=True).clamp_min(10 * _FAINT)
+    rough = a.std(1, correction=0, keepdim=True) >= _ROUGH * a.mean(1, keepdim=True).clamp_min(10 * _FAINT)
     below, above = depth - d.amin(1, keepdim=True), d.amax(1, keepdim=True) - depth
-    return rough & (below > _BELOW) & (above > _ABOVE) & (below + above > _STEP)
+    return rough & (below > _BELOW) & (above > _ABOVE) & (torch.maximum(below, above) > _STEP)
