@@ -76,9 +76,8 @@ class _Clouds:
         shape = (len(shifts), 2, tiles, kernel.POINTS)
         squared = torch.empty(shape, device=shifts.device)
         codes = torch.empty(shape if with_codes else 0, device=shifts.device, dtype=torch.int32)
-        with torch.cuda.device_of(
-            self.points
-        ):  # Triton launches on the current GPU, whichever the tensors are on
+        # Triton launches on the current GPU, whichever the tensors are on
+        with torch.cuda.device_of(self.points):  # type: ignore[no-untyped-call]
             kernel.search[(tiles, 2 * len(shifts))](
                 self.points, self.boxes, shifts, squared, codes, tiles,
                 WITH_CODES=with_codes, POINTS=kernel.POINTS, PART=kernel.PART, BLOCK=kernel.BLOCK, num_warps=1,
