@@ -108,7 +108,7 @@ def main() -> None:
         frame = batched(make_frame(raw, info, NOMINAL_CAMERA, decoder=decoder))
         if args.device != "cpu":
             burst = RawInput(raw[None], np.full(1, np.nan), info, NOMINAL_CAMERA)
-            found = predict_raw(burst, 0, weights, args.device)
+            found = predict_raw(burst, 0, weights, args.device, timed=True)
             print(
                 f"{args.device}: decode and copy {found.decode_ms:.2f} ms, cues and network {found.inference_ms:.2f} ms"
             )

@@ -162,7 +162,7 @@ def test_tables_are_built_before_the_clock_starts(weights, tmp_path, monkeypatch
 
     monkeypatch.setattr(predicting, "make_frame", watched)
     data = read_input(saved(tmp_path / "raw.npy", table_top(NOMINAL_CAMERA)[0]))
-    predict_raw(data, 0, weights)
+    predict_raw(data, 0, weights, timed=True)
     assert len(given) == predicting.WARM + predicting.RUNS
     assert len({id(d) for d in given}) == 1
 
@@ -181,7 +181,7 @@ def test_channels_in_another_order_are_refused(order, tmp_path):
 
 NOT_COUNTS = {
     "scaled to 1": (lambda raw: raw / 4095, "values up to 0", "multiply"),
-    "16 bits": (lambda raw: raw * 60.0, "at or beyond", "12"),
+    "16 bits": (lambda raw: raw * 60.0, "saturates at 4095, got values up to", "--saturation"),
     "8 bits": (lambda raw: (raw / 16).astype(np.uint8), "uint8", "uint16"),
     "not finite": (lambda raw: np.where(raw > 300, np.nan, raw), "finite", ""),
     "no light": (lambda raw: np.full_like(raw, 70), "no modulated light", ""),

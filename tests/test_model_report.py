@@ -20,7 +20,7 @@ import torch
 from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, FormatError
-from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
+from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
 from tofcapture.files.seal import sha256_of
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, TofMaps
 from tofcapture.files.shard_writer import ShardWriter
@@ -33,7 +33,7 @@ from tofcapture_model.config import preset
 from tofcapture_model.report import write_report
 from tofcapture_model.report.alignment import alignment
 from tofcapture_model.report.rigs import origin_of_alignment, transforms
-from tofcapture_model.report.scores import headline, tables
+from tofcapture_model.report.scores import headline, tables, tiles
 from tofcapture_model.report.training import loss_chart
 from tofcapture_model.runlog import read_metrics
 from tofcapture_model.zoo import build_model
@@ -130,6 +130,18 @@ def results_table(scene="ball", provenance=None):
         "training": provenance,
         "methods": {"sensor": method(0.0123456, 20.5), "model": method(0.0034567, 7.25)},
     }
+
+
+def suite_table(scene="ball", **runs):
+    """A results.json of a suite: the sensor, a method without parameters, networks by the names of their runs."""
+    table = results_table(scene)
+    del table["training"]
+    sensor, model = table["methods"].values()
+    worse = json.loads(json.dumps(model))
+    worse["depth"]["pixel"]["mae"] = 0.02
+    names = dict.fromkeys(key.rpartition("#")[0] for key in runs)
+    methods = {"sensor": sensor, "lf2": sensor} | dict(zip(names, (model, worse), strict=False))
+    return table | {"suite": "main", "runs": runs, "methods": methods, "spread": {}}
 
 
 def evidence_table(**changes):
@@ -345,6 +357,60 @@ def test_doubts_are_told(parts, tmp_path):
     ).read_text()
     assert "other weights than the table" in page
     assert "other scenes than" in page
+
+
+def test_a_suite_s_networks_have_a_sentence_each_and_the_best_has_the_tiles():
+    """By their names, the mean of runs as one; without any network the other method is told, and a lone sensor has no tiles."""
+    runs = {"ours#0": {}, "ours#1": {}, "a#b#0": {}}
+    results = suite_table(**runs)
+    text = headline(results)
+    assert "ours (mean of 2 runs) is 3.46 mm off in depth on average" in text
+    assert "72 % less" in text
+    assert "a#b is 20.00 mm off in depth" in text
+    assert "62 % more" in text
+    assert "lf2" not in text
+    assert tiles(results)[0] == ("depth error, mean", "3.46 mm", "ours, best of 2; sensor 12.35 mm")
+    assert tiles(suite_table(**{"ours#0": {}}))[0][2] == "ours; sensor 12.35 mm"
+    assert "lf2 is 12.35 mm off in depth" in headline(suite_table())
+    assert tiles({"methods": {"sensor": {}}, "runs": {}}) == []
+
+
+def test_doubts_about_a_suite_s_runs_are_told(parts, tmp_path):
+    """Every run that knows a scene or does not tell, and pictures by weights of none of them; nothing where one has made them."""
+    seen = {"ball": "object ball"}
+    runs = {
+        "new#0": {"training": {"steps": 1}, "not_new": {}},
+        "new#1": {"training": {"steps": 2}, "not_new": seen},
+        "old#0": {"training": {"steps": 4}, "not_new": None},
+    }
+
+    def page(table):
+        (tmp_path / "r.json").write_text(json.dumps(table))
+        given = {**parts, "results": tmp_path / "r.json"}
+        return write_report(**given, out=tmp_path / "o.html", views=1).read_text()
+
+    text = page(suite_table(**runs))
+    assert "new#1: 1 of 1 scenes are not new to it: ball (object ball)." in text
+    assert "old#0: its checkpoint does not tell" in text
+    assert "new#0" not in text
+    assert "other weights than the table" in text
+    assert "nothing to compare" not in text
+    assert "other weights" in page(suite_table())
+    runs["new#0"]["training"] = {"steps": 3}
+    assert "other weights" not in page(suite_table(**runs))
+
+
+def test_a_table_of_some_scenes_is_told(parts, tmp_path):
+    """Scenes of the split that were left out are no other scenes."""
+    dataset = tmp_path / "two"
+    manifest = load_manifest(parts["dataset"])
+    (entry,) = manifest.scenes.values()
+    (dataset / "shards").mkdir(parents=True)
+    (dataset / entry.path).symlink_to(parts["dataset"] / entry.path)
+    write_manifest(dataset, replace(manifest, scenes={"ball": entry, "box": entry}))
+    page = write_report(**{**parts, "dataset": dataset}, out=tmp_path / "o.html", views=1).read_text()
+    assert "measured on 1 of the 2 scenes of this dataset" in page
+    assert "other scenes than" not in page
 
 
 def test_command_writes_the_page(parts, tmp_path, capsys):

@@ -21,6 +21,7 @@ from tofcapture_model.config import Config, dumps_config, loads_config
 from tofcapture_model.zoo import Model, build_model
 
 FORMAT, VERSION = "tofcapture-model", 1
+_BUNDLED = Path("bundled")  # what a user may write where a path is asked for
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
@@ -104,9 +105,14 @@ def _halved(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return half
 
 
+def names_bundled(path: Path | None) -> bool:
+    """Whether a user means the bundled weights: nothing, or ``bundled`` where no file or folder of that name lies."""
+    return path is None or (Path(path) == _BUNDLED and not _BUNDLED.exists())
+
+
 def find_model(path: Path | None) -> Path:
-    """Resolve what a user calls a model: a file, the folder of a run, or nothing for the bundled weights."""
-    if path is None:
+    """Resolve what a user calls a model: a file, the folder of a run, or, by :func:`names_bundled`, the bundled weights."""
+    if path is None or names_bundled(path):
         bundled = Path(str(files("tofcapture_model") / "weights" / "model.safetensors"))
         if not bundled.exists():
             raise ConfigError(
@@ -122,7 +128,7 @@ def load_model(path: Path | None) -> tuple[Model, Config, dict[str, Any]]:
     Parameters
     ----------
     path
-        File, run folder, or ``None`` for the bundled weights.
+        File, run folder, or ``None`` or ``bundled`` for the bundled weights.
 
     Returns
     -------

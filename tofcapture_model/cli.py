@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 import ctypes
 import os
-from contextlib import suppress
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from tofcapture.command import Command, Outcome
-from tofcapture.errors import ConfigError
+from tofcapture.errors import ConfigError, TofError
 from tofcapture_model.config import Config, load_config, preset, presets
 from tofcapture_model.progress import progress
 from tofcapture_model.tables import SUITES
@@ -66,6 +68,12 @@ def _count(text: str) -> int:
     return int(text)
 
 
+def _not_negative(text: str) -> int:
+    if int(text) < 0:
+        raise argparse.ArgumentTypeError(f"expected a whole number >= 0, got {text}")
+    return int(text)
+
+
 def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "dataset",
@@ -82,9 +90,12 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, help="TOML with differences from a preset")
     parser.add_argument("--epochs", type=_count, help="of every stage, instead of the configuration's")
     parser.add_argument("--minutes", type=_positive, help="train for so long; schedules follow the clock")
-    parser.add_argument("--seed", type=int, help="of weights, order and crops")
+    parser.add_argument("--seed", type=_not_negative, help="of weights, order and crops")
     parser.add_argument(
-        "--workers", type=int, default=0, help="processes that read data (default: 0, data stays in memory)"
+        "--workers",
+        type=_not_negative,
+        default=0,
+        help="processes that read data (default: 0, data stays in memory)",
     )
     parser.add_argument(
         "--from",
@@ -151,18 +162,20 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
         "--weights",
         nargs="+",
         metavar="[NAME=]PATH",
-        help="checkpoint or folder of a run (default: the bundled weights); with --suite, NAME=PATH of several",
+        help="checkpoint or folder of a run (default: the bundled weights); with --suite, NAME=PATH of several (default: bundled)",
     )
     parser.add_argument(
         "--suite",
         choices=(*SUITES, "all"),
-        help="tables of several methods, written beside --out (docs/network.md)",
+        help="tables of several methods, written beside --out (docs/network.md); a killed one goes on",
     )
-    parser.add_argument("--scenes", default="", help="with --suite: only scenes whose name begins so")
+    parser.add_argument("--scenes", default="", help="only scenes whose name begins so")
     parser.add_argument("--out", type=Path, default=Path("results.json"), help="default: results.json")
     parser.add_argument("--split", choices=("train", "val", "test"), default="test", help="default: test")
     parser.add_argument(
-        "--frames", type=int, help="frames of every view; 0 takes all (default: 1, with --suite all)"
+        "--frames",
+        type=_not_negative,
+        help="frames of every view; 0 takes all (default: 1, with --suite all)",
     )
     _device(parser)
 
@@ -173,24 +186,49 @@ def _evaluate(args: argparse.Namespace) -> Outcome:
         return _suite(args)
     from tofcapture_model.evaluate import comparison, evaluate
 
-    if args.weights and (len(args.weights) > 1 or "=" in args.weights[0]):
-        raise ConfigError(
-            "several --weights need a --suite", hint="tofcapture evaluate DATASET --suite main ..."
-        )
-    with progress() as report:
+    weights = _one_network(args.weights)
+    with progress() as report, _no_going_on():
         results = evaluate(
             args.dataset,
-            Path(args.weights[0]) if args.weights else None,
+            weights,
             args.out,
             split=args.split,
             frames=1 if args.frames is None else args.frames,
+            scenes=args.scenes,
             device=_checked_device(args.device),
             progress=lambda done, total: report("evaluate", done / total),
         )
     return Outcome({**results, "results": str(args.out)}, f"{comparison(results)}\n{args.out}")
 
 
+def _one_network(weights: Sequence[str] | None) -> Path | None:
+    if not weights:
+        return None
+    if len(weights) > 1 or ("=" in weights[0] and not Path(weights[0]).exists()):
+        raise ConfigError(
+            f"--weights {' '.join(weights)}: several networks, or one with a name, need a --suite",
+            hint="tofcapture evaluate DATASET --suite main --weights NAME=PATH ...",
+        )
+    return Path(weights[0])
+
+
+class Interrupted(TofError):  # noqa: N818  the user's wish, not a fault
+    """The user stopped what keeps nothing."""
+
+    exit_code = 130
+
+
+@contextmanager
+def _no_going_on() -> Iterator[None]:
+    """Say of an interruption that the same command will not go on where it was."""
+    try:
+        yield
+    except KeyboardInterrupt as err:
+        raise Interrupted("interrupted", hint="nothing was kept: the same command begins anew") from err
+
+
 def _suite(args: argparse.Namespace) -> Outcome:
+    from tofcapture_model.checkpoint import find_model
     from tofcapture_model.suite import read_weights, run_suite, seen_before
     from tofcapture_model.tables import markdown
 
@@ -198,7 +236,7 @@ def _suite(args: argparse.Namespace) -> Outcome:
         results = run_suite(
             args.dataset,
             args.suite,
-            read_weights(args.weights or []),
+            read_weights(args.weights) if args.weights else {"bundled": [find_model(None)]},
             args.out,
             split=args.split,
             frames=args.frames or 0,
@@ -213,11 +251,13 @@ def _suite(args: argparse.Namespace) -> Outcome:
 
 def _configure_predict(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "input", type=Path, help="view file or shard (.h5), or raw (8, H, W) or (F, 8, H, W) (.npy)"
+        "input", type=Path, help="view file or shard (.h5), or raw (8, H, W) or (F, 8, H, W) (.npy, .npz)"
     )
     parser.add_argument("--out", type=Path, default=Path("prediction"), help="folder (default: prediction)")
     parser.add_argument(
-        "--weights", type=Path, help="checkpoint or folder of a run (default: the bundled weights)"
+        "--weights",
+        type=Path,
+        help="checkpoint, folder of a run, or 'bundled' (default: the bundled weights)",
     )
     parser.add_argument("--view", type=int, default=0, help="of a shard (default: 0)")
     which = parser.add_mutually_exclusive_group()
@@ -225,7 +265,13 @@ def _configure_predict(parser: argparse.ArgumentParser) -> None:
     which.add_argument(
         "--average", action="store_true", help="take the mean of the burst instead of one frame"
     )
-    parser.add_argument("--rig", type=Path, help="rig.toml for a .npy (default: nominal intrinsics)")
+    parser.add_argument("--rig", type=Path, help="rig.toml for an array (default: nominal intrinsics)")
+    parser.add_argument(
+        "--saturation",
+        type=_positive,
+        metavar="COUNTS",
+        help="at which the sensor of an array saturates (default: 4095, 12 bits)",
+    )
     parser.add_argument(
         "--backend",
         choices=("torch", "onnx"),
@@ -248,17 +294,28 @@ def _predict(args: argparse.Namespace) -> Outcome:
         rig=args.rig,
         device=_checked_device(args.device),
         backend=args.backend,
+        saturation=args.saturation,
     )
     size = " x ".join(str(n) for n in reversed(result["shape"]))
-    text = f"{args.out}: depth, normals and expected error at {size}, network took {result['inference_ms']:.0f} ms"
+    told = result["median_expected_error"] is not None
+    what = "depth, normals and expected error" if told else "depth and normals"
+    text = f"{args.out}: {what} at {size}, network took {result['inference_ms']:.0f} ms"
+    if not told:
+        text += f"\nno expected error: {result['network']} predicts none"
+    if result["filled"]:
+        text += f"\n{result['measured']:.1%} of the pixels were measured, the others filled (measured.npy says which)"
     if result["assumed"]:
         text += f"\nassumed: {result['assumed']}; --rig brings those of your camera"
+    if result["warning"]:
+        print(f"tofcapture: {result['warning']}", file=sys.stderr)
     return Outcome(result, text)
 
 
 def _configure_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--weights", type=Path, help="checkpoint or folder of a run (default: the bundled weights)"
+        "--weights",
+        type=Path,
+        help="checkpoint, folder of a run, or 'bundled' (default: the bundled weights)",
     )
     parser.add_argument(
         "--out", type=Path, help="default: beside the weights, or here for the bundled ones, .onnx or .pt2"
@@ -278,13 +335,12 @@ def _configure_export(parser: argparse.ArgumentParser) -> None:
 
 def _export(args: argparse.Namespace) -> Outcome:
     _share_cores()
-    from tofcapture_model.checkpoint import find_model
-    from tofcapture_model.export import export
+    from tofcapture_model.checkpoint import find_model, names_bundled
+    from tofcapture_model.export import SUFFIX, export
 
-    beside = (
-        find_model(args.weights) if args.weights else Path("model")
-    )  # the bundled weights are no place to write to
-    out = args.out or beside.with_suffix(".onnx" if args.format == "onnx" else ".pt2")
+    # the bundled weights are no place to write to
+    beside = Path("model") if names_bundled(args.weights) else find_model(args.weights)
+    out = args.out or beside.with_suffix(SUFFIX[args.format])
     result = export(args.weights, out, kind=args.format, size=(args.size[0], args.size[1]))
     worst = max(result["differences"].values())
     return Outcome(

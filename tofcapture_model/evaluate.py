@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from tofcapture.errors import ConfigError
 from tofcapture.files.manifest import load_manifest
+from tofcapture.files.seal import PARTIAL
 from tofcapture_model.baselines import sensor
 from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.data import FrameDataset, batched
@@ -118,6 +120,7 @@ def evaluate(
     *,
     split: str = "test",
     frames: int = 1,
+    scenes: str = "",
     device: str = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
@@ -135,6 +138,8 @@ def evaluate(
         ``train``, ``val`` or ``test``.
     frames
         Frames of every view that are evaluated; 0: all.
+    scenes
+        Only scenes whose name begins so.
     device
         Torch device.
     progress
@@ -143,10 +148,17 @@ def evaluate(
     Returns
     -------
     What was written; lengths in metres.
+
+    Raises
+    ------
+    ConfigError
+        ``out`` cannot be written, or no scene of the split begins so.
     """
+    expect_writable(Path(out))
     model, config, provenance = load_model(weights)
     model.to(device)
     data = FrameDataset(dataset, split, frames=frames)
+    measured = take_scenes(data, split, scenes)
     methods: dict[str, Method] = {"sensor": sensor.estimate, "model": model_method(model)}
     scores, empty = score(methods, data, torch.device(device), progress)
     reader = next(iter(data.readers.values()))
@@ -155,7 +167,7 @@ def evaluate(
         "version": VERSION,
         "dataset": str(dataset),
         "split": split,
-        "scenes": sorted(data.readers),
+        "scenes": measured,
         "views": len({(s.scene, s.view) for s in data.samples}),
         "frames": len(data.samples),
         "frames_without_ground_truth": empty,
@@ -164,7 +176,7 @@ def evaluate(
         "weights": str(find_model(weights)),
         "network": config.network.kind,
         "training": origin(provenance),
-        "not_new": not_new(provenance, dataset, split),
+        "not_new": not_new_of(provenance, dataset, split, measured),
         "methods": {name: s.table() for name, s in scores.items()},
     }
     data.close()
@@ -172,10 +184,55 @@ def evaluate(
     return results
 
 
+def expect_writable(path: Path) -> None:
+    """Say before anything is measured that results cannot be written.
+
+    Raises
+    ------
+    ConfigError
+        It names a folder, or there is no right or no room to write.
+    """
+    if path.is_dir():
+        raise ConfigError(f"--out {path}: is a folder", hint=f"--out {path / 'results.json'}")
+    partial = path.with_name(path.name + PARTIAL)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.open("wb").close()
+        partial.unlink()
+    except OSError as err:
+        raise ConfigError(
+            f"--out {path}: cannot be written: {err.strerror}", hint="name a file where you may write"
+        ) from err
+
+
+def take_scenes(data: FrameDataset, split: str, prefix: str) -> list[str]:
+    """Leave only frames of scenes whose name begins so; return the scenes' names, sorted.
+
+    Raises
+    ------
+    ConfigError
+        There is none.
+    """
+    data.samples = [s for s in data.samples if s.scene.startswith(prefix)]
+    if not data.samples:
+        raise ConfigError(
+            f"--scenes {prefix}: no scene of the split {split} begins so", hint=", ".join(data.readers)
+        )
+    return sorted({s.scene for s in data.samples})
+
+
+def not_new_of(
+    provenance: Mapping[str, Any], dataset: Path, split: str, scenes: Collection[str]
+) -> dict[str, str] | None:
+    """Of these scenes of a split those that a network has learned from, as :func:`tofcapture_model.learned.not_new` says."""
+    found = not_new(provenance, dataset, split)
+    return None if found is None else {name: why for name, why in found.items() if name in scenes}
+
+
 def write_results(path: Path, results: dict[str, Any]) -> None:
     """Write ``results.json`` atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(path.name + PARTIAL)
     with partial.open("w", encoding="utf-8") as file:
         json.dump(results, file, indent=1, allow_nan=False)
         file.flush()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from tofcapture.errors import ConfigError, DataError
-from tofcapture.files.seal import write_text
+from tofcapture.files.seal import sha256_of
 from tofcapture_model.checkpoint import find_model, load_model
+from tofcapture_model.config import dumps_config
 from tofcapture_model.frame import Estimate, Frame
-from tofcapture_model.onnx_backend import OUTPUTS, ask_onnx, open_onnx
+from tofcapture_model.onnx_backend import CONFIG, DIGEST, OUTPUTS, ask_onnx, open_onnx
 
+SUFFIX = {"onnx": ".onnx", "torch": ".pt2"}
 SIZE = (180, 240)  # px, sensor rows and columns
 OPSET = 17
 TOLERANCE = 1e-4  # m, and of a unit normal; refinement compares with thresholds, which rounding may cross in few pixels
@@ -62,12 +65,15 @@ def export(
 ) -> dict[str, Any]:
     """Export a model and hold the result against torch on two batch sizes.
 
+    The export carries its configuration and the SHA-256 of the checkpoint
+    (:data:`tofcapture_model.onnx_backend.DIGEST`). Nothing but ``out`` is written.
+
     Parameters
     ----------
     weights
         Checkpoint or run folder; ``None``: the bundled weights.
     out
-        ``.onnx`` (kind ``onnx``) or ``.pt2`` (kind ``torch``); the configuration is written beside it as ``.toml``.
+        ``.onnx`` (kind ``onnx``) or ``.pt2`` (kind ``torch``); an export that was there is replaced.
     kind
         ``onnx`` or ``torch``.
     size
@@ -79,19 +85,22 @@ def export(
 
     Raises
     ------
+    ConfigError
+        ``out`` has another suffix, is a folder, or lies in what is none.
     DataError
         The exported model answers differently.
     """
-    model, _, _ = load_model(weights)
+    _expect_file(out, kind)
+    model, config, _ = load_model(weights)
+    told = {DIGEST: sha256_of(find_model(weights)), CONFIG: dumps_config(config)}
     flat = Flat(model).eval()
     for parameter in flat.parameters():
         parameter.requires_grad_(False)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(f"partial-{out.name}")  # torch wants its suffix
-    (_onnx if kind == "onnx" else _program)(flat, partial, size)
-    differences = _differences(flat, partial, kind, size)
-    partial.replace(out)
-    write_text(out.with_suffix(".toml"), find_model(weights).with_suffix(".toml").read_text(encoding="utf-8"))
+    with tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent) as folder:
+        partial = Path(folder) / out.name  # torch wants its suffix
+        (_onnx if kind == "onnx" else _program)(flat, partial, size, told)
+        differences = _differences(flat, partial, kind, size)
+        partial.replace(out)
     return {
         "out": str(out),
         "kind": kind,
@@ -101,9 +110,25 @@ def export(
     }
 
 
-def _onnx(flat: nn.Module, path: Path, size: tuple[int, int]) -> None:
+def _expect_file(out: Path, kind: str) -> None:
+    if out.suffix != SUFFIX[kind]:
+        raise ConfigError(
+            f"--out {out}: expected a name that ends in {SUFFIX[kind]}, got {out.suffix or 'no suffix'}",
+            hint="--format onnx writes .onnx, --format torch writes .pt2",
+        )
     try:
-        import onnx  # noqa: F401
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as err:
+        raise ConfigError(f"--out {out}: {err.strerror}: {err.filename}", hint="name another folder") from err
+    if out.is_dir():
+        raise ConfigError(
+            f"--out {out}: expected a file, got a folder", hint=f"--out {out / 'model'}{SUFFIX[kind]}"
+        )
+
+
+def _onnx(flat: nn.Module, path: Path, size: tuple[int, int], told: dict[str, str]) -> None:
+    try:
+        import onnx
         import onnxruntime  # noqa: F401
     except ImportError as err:
         raise ConfigError(f"cannot export to ONNX: {err}", hint="pip install tofcapture[onnx]") from err
@@ -118,14 +143,17 @@ def _onnx(flat: nn.Module, path: Path, size: tuple[int, int]) -> None:
         opset_version=OPSET,
         dynamo=False,
     )
+    made = onnx.load(str(path))
+    onnx.helper.set_model_props(made, told)
+    onnx.save(made, str(path))
 
 
-def _program(flat: nn.Module, path: Path, size: tuple[int, int]) -> None:
+def _program(flat: nn.Module, path: Path, size: tuple[int, int], told: dict[str, str]) -> None:
     batch = torch.export.Dim("batch", min=1, max=1024)
     shapes = (tuple({0: batch} for _ in Frame._fields),)
     program = torch.export.export(flat, tuple(example(2, size)), dynamic_shapes=shapes, strict=False)
     with path.open("wb") as file:
-        torch.export.save(program, file)
+        torch.export.save(program, file, extra_files=told)
 
 
 def _differences(flat: nn.Module, path: Path, kind: str, size: tuple[int, int]) -> dict[str, float]:

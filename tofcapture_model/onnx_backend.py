@@ -10,9 +10,14 @@ import torch
 from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError
+from tofcapture.files.seal import sha256_of
+from tofcapture_model.config import Config, loads_config
 from tofcapture_model.frame import Frame
 
 OUTPUTS = ("depth_2x", "normals_2x", "error_2x")
+DIGEST, CONFIG = "weights_sha256", "config.toml"
+"""What an export carries beside the network: SHA-256 of the checkpoint's file, and its configuration. Metadata of ``.onnx``, extra files
+of ``.pt2``."""
 
 
 def open_onnx(path: Path) -> Any:
@@ -24,6 +29,37 @@ def open_onnx(path: Path) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def config_of(session: Any, path: Path, weights: Path) -> Config:
+    """Configuration of an opened export, once it is certain that the export is one of these weights.
+
+    Parameters
+    ----------
+    session
+        What :func:`open_onnx` opened.
+    path
+        The export, for messages.
+    weights
+        The checkpoint beside it; where there is none, the export stands for itself.
+
+    Raises
+    ------
+    ConfigError
+        The export is of other weights, or too old to tell.
+    """
+    told = session.get_modelmeta().custom_metadata_map
+    again = f"run tofcapture export again: tofcapture export --weights {weights} --out {path}"
+    if DIGEST not in told or CONFIG not in told:
+        raise ConfigError(
+            f"{path}: expected an export that says of which weights it is, got none", hint=again
+        )
+    if weights.exists() and (found := sha256_of(weights)) != told[DIGEST]:
+        raise ConfigError(
+            f"{path}: expected an export of {weights} (sha256 {found[:12]}...), got one of other weights ({told[DIGEST][:12]}...)",
+            hint=again,
+        )
+    return loads_config(told[CONFIG], str(path))
 
 
 def ask_onnx(session: Any, frame: Frame) -> list[NDArray[np.float32]]:

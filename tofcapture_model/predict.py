@@ -1,7 +1,8 @@
-"""Predict depth, normals and error map of one frame, from a view file, a shard or a plain ``.npy``."""
+"""Predict depth, normals and error map of one frame, from a view file, a shard or a plain array; or of many, with :class:`Predictor`."""
 
 from __future__ import annotations
 
+import math
 import statistics
 import struct
 import time
@@ -9,7 +10,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -17,13 +18,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tofcapture.camera import Camera
-from tofcapture.errors import ConfigError
+from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.seal import write_text
-from tofcapture.ops.phase import frequencies
+from tofcapture.frames import TofInfo
+from tofcapture.ops.phase import Decoder, frequencies
 from tofcapture_model.checkpoint import find_model, load_model
-from tofcapture_model.data import batched, decode_frame, frame_decoder, make_frame, with_cues
+from tofcapture_model.config import BASELINES
+from tofcapture_model.data import MAX_RANGE, batched, decode_frame, frame_decoder, make_frame, with_cues
 from tofcapture_model.frame import Frame, frame_to
-from tofcapture_model.raw_input import RawInput, read_input
+from tofcapture_model.raw_input import RawInput, expect_finite, read_input, taken
 
 Float32 = NDArray[np.float32]
 T = TypeVar("T")
@@ -39,31 +42,162 @@ class Prediction:
 
     Attributes
     ----------
-    depth, error
-        (2H, 2W) float32 metres: z, and its expected absolute error.
+    depth
+        (2H, 2W) float32 metres: z.
+    error
+        (2H, 2W) float32 metres: expected absolute error of the depth; ``None`` from a network that predicts none.
     normals
         (2H, 2W, 3) float32, unit, ToF frame, facing the camera.
+    measured
+        (2H, 2W) bool: the sensor measured at this pixel; elsewhere the network started from the nearest pixel that did.
     camera
         Intrinsics of the (2H, 2W) grid.
+    network
+        Kind of network that answered.
     inference_ms
-        Median time of the network, after loading and decoding; on a GPU with that of the physical cues.
+        Median time of the network, after loading and decoding; on a GPU with that of the physical cues; NaN: not timed.
     decode_ms
         Median time of decoding the raw frame, after the camera's tables are built, and of the physical cues; on a GPU of decoding and
-        of the way there.
+        of the way there; NaN: not timed.
     """
 
     depth: Float32
-    error: Float32
+    error: Float32 | None
     normals: Float32
+    measured: NDArray[np.bool_]
     camera: Camera
-    inference_ms: float
-    decode_ms: float
+    network: str
+    inference_ms: float = math.nan
+    decode_ms: float = math.nan
+
+
+class _Watch(Protocol):
+    """Do some work, wait for the device, and say how many milliseconds it took."""
+
+    def __call__(self, work: Callable[[], T], wait: Callable[[], None], /) -> tuple[T, float]: ...
+
+
+class Predictor:
+    """A network that answers frame after frame: loaded once, and on a GPU recorded once per image size.
+
+    Call it with
+
+    - ``raw``: (K, H, W) taps of one frame, any real dtype, or a mean that :func:`tofcapture_model.raw_input.taken` took;
+    - ``info``: :class:`tofcapture.frames.TofInfo`, channels, saturation, light source, range errors; keep handing over the same one,
+      since another one has new decoding tables built, which takes as long as some frames;
+    - ``camera``: calibrated intrinsics, ``None``: those of ``info``;
+    - ``celsius``: sensor temperature, NaN: unknown.
+
+    It returns a :class:`Prediction` without times: depth, expected error (m), normals and what was measured, at (2H, 2W), in arrays of
+    its own.
+
+    Parameters
+    ----------
+    weights
+        Checkpoint or folder of a run; ``None``: the bundled one.
+    device
+        Torch device.
+    backend
+        ``torch``, or ``onnx`` for the ``model.onnx`` that lies beside the checkpoint; that runs on the CPU.
+
+    Raises
+    ------
+    ConfigError
+        No such weights or export, an export of other weights; when called: a camera with distortion, or of another size than the
+        export's.
+    DataError
+        When called: taps that are not finite, or of a frame in which no pixel measured anything.
+    """
+
+    def __init__(self, weights: Path | None = None, device: str = "cpu", backend: str = "torch") -> None:
+        self._ask, self.network = _onnx_model(weights) if backend == "onnx" else _torch_model(weights, device)
+        self._place = torch.device("cpu" if backend == "onnx" else device)
+        self._known: tuple[TofInfo, Camera, Decoder] | None = None
+        self._recorded: dict[tuple[tuple[int, ...], float], Ask] = {}
+        if self._on_gpu:
+            torch.cuda.set_device(self._place)  # streams, graphs and waiting are the current one's
+
+    def __call__(
+        self, raw: NDArray[Any], info: TofInfo, camera: Camera | None = None, celsius: float = math.nan
+    ) -> Prediction:
+        """Answer for one frame."""
+        return self._answer(raw, info, camera or info.camera, celsius, "raw frame", _untimed)
+
+    @property
+    def _on_gpu(self) -> bool:
+        return self._place.type == "cuda"
+
+    def _answer(
+        self, raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float, where: str, watch: _Watch
+    ) -> Prediction:
+        if camera.distortion:
+            raise ConfigError(
+                f"{where}: expected images without lens distortion, as all networks do, got k1 {camera.distortion[0]:.4g} and more",
+                hint="rectify each raw channel before it is recorded, or leave a small distortion out of the rig: docs/howto/own-camera.md",
+            )
+        expect_finite(raw, where)
+        parts = (raw, info, camera, celsius, self._decoder(info, camera))
+        decode = decode_frame if self._on_gpu else make_frame  # a GPU has its cues computed there
+        wait: Callable[[], None] = torch.cuda.synchronize if self._on_gpu else lambda: None
+        with torch.inference_mode():
+            inputs, decode_ms = watch(lambda: frame_to(batched(decode(*parts)), self._place), wait)
+            measured = inputs.valid[0, 0].cpu().numpy() > 0
+            if not measured.any():
+                raise _nothing(raw, info, where)
+            launch = self._launch(inputs, frequencies(info.modulation_hz)[1])
+            (depth, normals, error), inference_ms = watch(lambda: launch(inputs), wait)
+        return Prediction(
+            depth=_image(depth)[0],
+            error=None if self.network in BASELINES else _image(error)[0],
+            normals=np.ascontiguousarray(_image(normals).transpose(1, 2, 0)),
+            measured=measured.repeat(2, axis=0).repeat(2, axis=1),
+            camera=camera.scaled(2),
+            network=self.network,
+            inference_ms=inference_ms,
+            decode_ms=decode_ms,
+        )
+
+    def _decoder(self, info: TofInfo, camera: Camera) -> Decoder:
+        if self._known is None or self._known[0] is not info or self._known[1] != camera:
+            self._known = info, camera, frame_decoder(info, camera)
+        return self._known[2]
+
+    def _launch(self, inputs: Frame, hz: float) -> Ask:
+        if not self._on_gpu:
+            return self._ask
+        key = (tuple(inputs.raw.shape), hz)
+        if key not in self._recorded:
+            self._recorded[key] = recorded(lambda frame: self._ask(with_cues(frame, hz)), inputs)
+        return self._recorded[key]
+
+
+def _image(tensor: Tensor) -> Float32:
+    """(C, H, W) array of its own: what a graph answers lasts only until its next launch."""
+    return np.array(tensor[0].float().cpu().numpy())
+
+
+def _nothing(raw: NDArray[Any], info: TofInfo, where: str) -> DataError:
+    """Say of a frame that has no depth anywhere why that may be."""
+    share = float((raw.max(axis=0) >= info.saturation).mean())
+    what = f"{share:.0%} of them are saturated" if share else "no light, or none that was modulated"
+    return DataError(
+        f"{where}: expected pixels that measure a depth between 0.05 and {MAX_RANGE:g} m, got none of {raw[0].size}: {what}",
+        hint="choose another --frame, or record again with another exposure",
+    )
 
 
 def predict_raw(
-    data: RawInput, frame: int | None, weights: Path | None, device: str = "cpu", backend: str = "torch"
+    data: RawInput,
+    frame: int | None,
+    weights: Path | None,
+    device: str = "cpu",
+    backend: str = "torch",
+    *,
+    timed: bool = False,
 ) -> Prediction:
-    """Run a model on one frame of a burst, or with ``frame = None`` on the burst's mean (taps are linear, so it may be taken).
+    """Run a model on one frame of a burst, or with ``frame = None`` on the burst's mean (:func:`tofcapture_model.raw_input.taken`).
+
+    For more than one frame, :class:`Predictor` loads the model once.
 
     Parameters
     ----------
@@ -77,33 +211,18 @@ def predict_raw(
         Torch device.
     backend
         ``torch``, or ``onnx`` for the ``model.onnx`` that lies beside the checkpoint.
+    timed
+        Decode and ask ten times, and tell how long it takes.
     """
-    if frame is not None and not 0 <= frame < len(data.raw):
-        raise ConfigError(f"expected a frame of 0 to {len(data.raw) - 1}, got {frame}")
-    taken = slice(None) if frame is None else slice(frame, frame + 1)
-    raw, celsius = data.raw[taken].mean(axis=0, dtype=np.float64), float(data.celsius[taken].mean())
-    ask = _onnx_model(weights, data.camera) if backend == "onnx" else _torch_model(weights, device)
-    parts = (raw, data.info, data.camera, celsius, frame_decoder(data.info, data.camera))
-    place = torch.device("cpu" if backend == "onnx" else device)
-    on_gpu = place.type == "cuda"
-    wait: Callable[[], None] = torch.cuda.synchronize if on_gpu else lambda: None
-    with torch.inference_mode():
-        if on_gpu:
-            hz = frequencies(data.info.modulation_hz)[1]
-            inputs, decode_ms = _timed(lambda: frame_to(batched(decode_frame(*parts)), place), wait)
-            launch = recorded(lambda frame: ask(with_cues(frame, hz)), inputs)
-        else:
-            decoded, decode_ms = _timed(lambda: make_frame(*parts), wait)
-            inputs, launch = frame_to(batched(decoded), place), ask
-        (depth, normals, error), inference_ms = _timed(lambda: launch(inputs), wait)
-    return Prediction(
-        depth=depth[0, 0].cpu().numpy(),
-        error=error[0, 0].cpu().numpy(),
-        normals=np.ascontiguousarray(normals[0].permute(1, 2, 0).cpu().numpy()),
-        camera=data.camera.scaled(2),
-        inference_ms=inference_ms,
-        decode_ms=decode_ms,
-    )
+    raw, celsius = taken(data.raw, frame, data.info.saturation, data.celsius)
+    predictor = Predictor(weights, device, backend)
+    watch = _timed if timed else _untimed
+    return predictor._answer(raw, data.info, data.camera, celsius, data.named(frame) or "raw frame", watch)  # noqa: SLF001
+
+
+def _untimed(work: Callable[[], T], _wait: Callable[[], None]) -> tuple[T, float]:
+    """Answer of some work, once."""
+    return work(), math.nan
 
 
 def _timed(work: Callable[[], T], wait: Callable[[], None]) -> tuple[T, float]:
@@ -156,8 +275,8 @@ def recorded(ask: Ask, like: Frame) -> Ask:
     return replay
 
 
-def _torch_model(weights: Path | None, device: str) -> Ask:
-    """Compute as it was trained: in bfloat16 if that is how it learned, and where the processor has it."""
+def _torch_model(weights: Path | None, device: str) -> tuple[Ask, str]:
+    """Compute as it was trained: in bfloat16 if that is how it learned, and where the processor has it. With the network's kind."""
     model, config, _ = load_model(weights)
     model = model.to(device)
     kind = torch.device(device).type
@@ -169,7 +288,7 @@ def _torch_model(weights: Path | None, device: str) -> Ask:
             found = model(frame)
         return found.depth, found.normals, found.error
 
-    return ask
+    return ask, config.network.kind
 
 
 def has_bfloat16(kind: str) -> bool:
@@ -182,26 +301,29 @@ def has_bfloat16(kind: str) -> bool:
     )
 
 
-def _onnx_model(weights: Path | None, camera: Camera) -> Ask:
-    from tofcapture_model.onnx_backend import ask_onnx, open_onnx
+def _onnx_model(weights: Path | None) -> tuple[Ask, str]:
+    from tofcapture_model.onnx_backend import ask_onnx, config_of, open_onnx
 
-    path = find_model(weights).with_suffix(".onnx")
+    named = find_model(weights)  # a checkpoint, or the export itself
+    path = named.with_suffix(".onnx")
     if not path.exists():
         raise ConfigError(
             f"{path}: no such file", hint="tofcapture export --out DIR/model.onnx, then predict --weights DIR"
         )
     session = open_onnx(path)
+    config = config_of(session, path, named if named != path else path.with_suffix(".safetensors"))
     size = tuple(session.get_inputs()[0].shape[-2:])
-    if size != camera.shape:
-        raise ConfigError(
-            f"{path}: exported for frames of {size}, got {camera.shape}", hint="tofcapture export --size"
-        )
 
     def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        got = tuple(frame.depth.shape[-2:])
+        if size != got:
+            raise ConfigError(
+                f"{path}: exported for frames of {size}, got {got}", hint="tofcapture export --size"
+            )
         depth, normals, error = (torch.from_numpy(x) for x in ask_onnx(session, frame))
         return depth, normals, error
 
-    return ask
+    return ask, config.network.kind
 
 
 def png_bytes(image: NDArray[Any]) -> bytes:
@@ -220,10 +342,13 @@ def png_bytes(image: NDArray[Any]) -> bytes:
 
 
 def ply_bytes(prediction: Prediction) -> bytes:
-    """Encode points, normals and expected error as binary PLY, metres, ToF frame."""
-    points = prediction.camera.unproject(prediction.depth)
-    rows = np.concatenate([points, prediction.normals, prediction.error[..., None]], axis=-1).reshape(-1, 7)
-    names = ("x", "y", "z", "nx", "ny", "nz", "expected_error")
+    """Encode points, normals and, where there is one, expected error as binary PLY, metres, ToF frame."""
+    columns: list[NDArray[Any]] = [prediction.camera.unproject(prediction.depth), prediction.normals]
+    names = ["x", "y", "z", "nx", "ny", "nz"]
+    if prediction.error is not None:
+        columns.append(prediction.error[..., None])
+        names.append("expected_error")
+    rows = np.concatenate(columns, axis=-1).reshape(-1, len(names))
     header = ["ply", "format binary_little_endian 1.0", "comment units m", f"element vertex {len(rows)}"]
     header += [*(f"property float {n}" for n in names), "end_header", ""]
     return "\n".join(header).encode() + rows.astype("<f4").tobytes()
@@ -232,16 +357,23 @@ def ply_bytes(prediction: Prediction) -> bytes:
 def write_prediction(prediction: Prediction, out: Path) -> dict[str, str]:
     """Write a prediction into a folder.
 
-    ``depth.npy``, ``error.npy`` (float32 metres), ``normals.npy``, ``cloud.ply``, ``depth.png`` (16 bit, unit 0.1 mm, so up to
-    6.5535 m), ``normals.png`` (8 bit, ``(n + 1) / 2`` with y and z towards the viewer), ``units.txt``.
+    ``depth.npy``, ``error.npy`` (float32 metres), ``normals.npy``, ``measured.npy`` (bool), ``cloud.ply``, ``depth.png`` (16 bit,
+    unit 0.1 mm, so up to 6.5535 m), ``normals.png`` (8 bit, ``(n + 1) / 2`` with y and z towards the viewer), ``units.txt``. From a
+    network that predicts no error there is no ``error.npy``; one of an earlier prediction is removed.
 
     Returns
     -------
     Path of every file by its name.
     """
     out.mkdir(parents=True, exist_ok=True)
-    for name in ("depth", "error", "normals"):
-        np.save(out / f"{name}.npy", getattr(prediction, name))
+    (out / "error.npy").unlink(missing_ok=True)
+    arrays = {
+        f"{name}.npy": array
+        for name in ("depth", "normals", "error", "measured")
+        if (array := getattr(prediction, name)) is not None
+    }
+    for name, array in arrays.items():
+        np.save(out / name, array)
     tenth_mm = np.clip(np.rint(prediction.depth * 1e4), 0, 65535).astype(np.uint16)
     colours = ((prediction.normals * [1, -1, -1] + 1) * 127.5).clip(0, 255).astype(np.uint8)
     (out / "depth.png").write_bytes(png_bytes(tenth_mm))
@@ -249,10 +381,21 @@ def write_prediction(prediction: Prediction, out: Path) -> dict[str, str]:
     (out / "cloud.ply").write_bytes(ply_bytes(prediction))
     write_text(
         out / "units.txt",
-        "npy, ply: metres, ToF frame (x right, y down, z forward)\ndepth.png: 0.1 mm per count\n",
+        "npy, ply: metres, ToF frame (x right, y down, z forward)\n"
+        "measured.npy: bool, true where the depth stands on a measurement, false where the sensor had none and it was filled\n"
+        "depth.png: 0.1 mm per count\n",
     )
-    names = ("depth.npy", "normals.npy", "error.npy", "depth.png", "normals.png", "cloud.ply", "units.txt")
+    names = (*arrays, "depth.png", "normals.png", "cloud.ply", "units.txt")
     return {name: str(out / name) for name in names}
+
+
+def _expect_folder(out: Path) -> None:
+    """Refuse, before anything is computed, a folder that cannot be made."""
+    there = next((p for p in (out, *out.parents) if p.exists()), None)
+    if there is not None and not there.is_dir():
+        raise ConfigError(
+            f"--out {out}: expected a folder, but {there} is a file", hint="name another folder"
+        )
 
 
 def predict(
@@ -265,21 +408,29 @@ def predict(
     rig: Path | None = None,
     device: str = "cpu",
     backend: str = "torch",
+    saturation: float | None = None,
 ) -> dict[str, Any]:
     """Predict from a file and write the result; returns what ``--json`` prints."""
-    data = read_input(Path(path), view, rig)
-    prediction = predict_raw(data, frame, weights, device, backend)
+    _expect_folder(Path(out))
+    data = read_input(Path(path), view, rig, saturation=saturation, frame=frame)
+    prediction = predict_raw(data, frame, weights, device, backend, timed=True)
     written = write_prediction(prediction, Path(out))
     used = find_model(weights)
+    share = float(prediction.measured.mean())
+    error = prediction.error
     return {
         "input": str(path),
         "assumed": data.assumed,
+        "warning": data.warning,
+        "measured": round(share, 4),
+        "filled": round(1 - share, 4),
+        "network": prediction.network,
         "weights": str(used.with_suffix(".onnx") if backend == "onnx" else used),
         "inference_ms": round(prediction.inference_ms, 2),
         "decode_ms": round(prediction.decode_ms, 2),
         "shape": list(prediction.depth.shape),
         "median_depth": float(np.median(prediction.depth)),
-        "median_expected_error": float(np.median(prediction.error)),
+        "median_expected_error": None if error is None else float(np.median(error)),
         "units": "m",
         "files": written,
     }

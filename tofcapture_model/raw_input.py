@@ -1,8 +1,11 @@
-"""What a prediction starts from: a burst of raw frames from a view file, a shard or a plain ``.npy``, and a look at whether it makes sense."""
+"""What a prediction starts from: a burst of raw frames from a view file, a shard or a plain array, and a look at whether it makes sense."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import zipfile
+import zlib
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +34,10 @@ NOMINAL_RANGE_ERRORS = (
 """Range errors measured on that sensor; taken for a plain array without a rig whose two frequencies agree with them and not without."""
 
 CHANNELS = "20 MHz at 0, 90, 180, 270 deg, then 100 MHz at the same"
+SATURATION = 4095.0  # counts, of a 12-bit sensor: taken for an array unless it is said
+_ARRAYS = (".npy", ".npz")
+_KINDS = "a view file or a shard (.h5), or an array (.npy, .npz)"
+_SUSPICIOUS = 0.25  # of saturation: no count beyond it is what a sensor of two bits less would give
 _REACH = (0.05, 5.0)  # m, depths that a table-top rig can see; the networks take others for holes
 # In 76 frames of simulated cameras and rooms, all in the right order: at most 0.11, at least 0.97, at least 0.86.
 _HARMONIC, _AGREEMENT, _WITHIN = 0.3, 0.5, 0.5
@@ -38,88 +45,177 @@ _HARMONIC, _AGREEMENT, _WITHIN = 0.3, 0.5, 0.5
 
 @dataclass(frozen=True)
 class RawInput:
-    """A burst and what is needed to decode it: raw (F, 8, H, W), sensor temperatures (F,), camera, intrinsics; what was assumed."""
+    """A burst and what is needed to decode it.
+
+    Attributes
+    ----------
+    raw, celsius
+        (F, K, H, W) taps of all frames; (F,) sensor temperatures, NaN: unknown.
+    info, camera
+        Channels, saturation, light source, range errors; intrinsics.
+    source
+        The file, for messages.
+    assumed
+        What was taken for granted because nobody said it; empty: nothing.
+    warning
+        What looks wrong and may be right; empty: nothing.
+    """
 
     raw: NDArray[Any]
     celsius: NDArray[np.float64]
     info: TofInfo
     camera: Camera
+    source: str = ""
     assumed: str = ""
+    warning: str = ""
+
+    def named(self, frame: int | None) -> str:
+        """Call a frame, or with ``None`` the mean of all, by name."""
+        return self.source + _which(self.raw, frame)
 
 
-def read_input(path: Path, view: int = 0, rig: Path | None = None) -> RawInput:
+def _which(raw: NDArray[Any], frame: int | None) -> str:
+    if len(raw) == 1:
+        return ""
+    return ", mean of the burst" if frame is None else f", frame {frame}"
+
+
+def taken(
+    raw: NDArray[Any], frame: int | None, saturation: float, celsius: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Take one frame of a burst, or with ``frame = None`` the mean (taps are linear, so it may be taken).
+
+    A tap that is saturated in any frame is saturated in the mean: clipping took from its mean what nobody knows. The decoder goes by
+    the taps' values, so in the mean such a tap gets the saturation value, as it has in a single frame
+    (:meth:`tofcapture.ops.phase.Decoder.burst` has the same rule).
+
+    Parameters
+    ----------
+    raw
+        (F, K, H, W) taps.
+    frame
+        0 to F - 1, or ``None``.
+    saturation
+        Raw value from which a tap is saturated.
+    celsius
+        (F,) sensor temperatures.
+
+    Returns
+    -------
+    (K, H, W) float64 taps, and their sensor temperature.
+
+    Raises
+    ------
+    ConfigError
+        No such frame.
+    """
+    if frame is not None:
+        if not 0 <= frame < len(raw):
+            raise ConfigError(f"expected a frame of 0 to {len(raw) - 1}, got {frame}")
+        return raw[frame].astype(np.float64), float(celsius[frame])
+    mean = raw.mean(axis=0, dtype=np.float64)
+    mean[raw.max(axis=0) >= saturation] = saturation
+    return mean, float(celsius.mean())
+
+
+def read_input(
+    path: Path,
+    view: int = 0,
+    rig: Path | None = None,
+    *,
+    saturation: float | None = None,
+    frame: int | None = None,
+) -> RawInput:
     """Read a burst.
 
     Parameters
     ----------
     path
-        View file or shard (``.h5``), or an array (8, H, W) or (F, 8, H, W) (``.npy``): counts of a 12-bit sensor, in the order of
-        :data:`CHANNELS`.
+        View file or shard (``.h5``), or an array (8, H, W) or (F, 8, H, W) (``.npy``, or ``.npz`` with one array or with one called
+        ``raw``): counts in the order of :data:`CHANNELS`.
     view
         Of a shard.
     rig
         ``rig.toml`` for an array; without it, nominal intrinsics, and no range errors or :data:`NOMINAL_RANGE_ERRORS`, whichever the
         two frequencies agree with; ``assumed`` says which.
+    saturation
+        Counts at which the sensor of an array saturates; ``None``: :data:`SATURATION`.
+    frame
+        Of an array, what will be used and is looked at: one frame, or ``None``: the mean.
 
     Raises
     ------
     DataError
         Missing, damaged, of a wrong shape, or an array that is no four-phase raw data of this order and unit.
     ConfigError
-        No such view, or a rig for a file that carries its own.
+        No such view or frame, or a rig or a saturation for a file that carries its own.
     """
     if not path.is_file():
         what = "a folder, expected one file" if path.is_dir() else "no such file"
-        raise DataError(f"{path}: {what}", hint="a view file or a shard (.h5), or an array (.npy)")
-    if path.suffix == ".npy":
-        return _from_npy(path, rig)
-    if rig is not None:
-        raise ConfigError(
-            f"--rig {rig}: expected an array (.npy), got {path}", hint="views and shards carry their camera"
-        )
+        raise DataError(f"{path}: {what}", hint=_KINDS)
+    if path.suffix.lower() in _ARRAYS:
+        return _from_array(path, rig, saturation, frame)
+    for option, value in (("--rig", rig), ("--saturation", saturation)):
+        if value is not None:
+            raise ConfigError(
+                f"{option} {value}: expected an array ({', '.join(_ARRAYS)}), got {path}",
+                hint="views and shards carry their camera",
+            )
     return _from_h5(path, view)
 
 
-def _from_npy(path: Path, rig_path: Path | None) -> RawInput:
-    try:
-        raw = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as err:
-        raise DataError(f"{path}: cannot read the array: {err}") from err
+def _from_array(path: Path, rig_path: Path | None, saturation: float | None, frame: int | None) -> RawInput:
+    raw = _load(path)
     raw = raw[None] if raw.ndim == 3 else raw
     rig = load_rig(rig_path) if rig_path else None
     camera = rig.tof if rig else NOMINAL_CAMERA
     _check_shape(raw, camera, path)
-    mean = raw.mean(axis=0, dtype=np.float64)
+    limit = SATURATION if saturation is None else saturation
     celsius = np.full(len(raw), np.nan)
+    taps, _ = taken(raw, frame, limit, celsius)
+    expect_finite(taps, f"{path}{_which(raw, frame)}")
+    warning = _check_unit(raw, limit, path)
+    plain = TofInfo("array", "", camera, rig.illuminator if rig else np.zeros(3), saturation=limit)
     if rig:
-        info = _array_info(camera, rig.illuminator, rig.range_errors)
-        check_taps(mean, info, str(path))
-        return RawInput(raw, celsius, info, camera)
-    return _without_rig(raw, mean, celsius, path)
+        info, assumed = replace(plain, range_errors=rig.range_errors), ""
+        check_taps(taps, info, path, _which(raw, frame))
+    else:
+        info, words = _without_rig(taps, plain, path, _which(raw, frame))
+        assumed = f"nominal intrinsics of 240 x 180 pixels, {words}"
+    return RawInput(raw, celsius, info, camera, str(path), assumed, warning if saturation is None else "")
 
 
-def _array_info(
-    camera: Camera, illuminator: NDArray[np.float64], range_errors: tuple[RangeError, ...]
-) -> TofInfo:
-    return TofInfo("array", "", camera, illuminator, range_errors=range_errors)
-
-
-def _without_rig(
-    raw: NDArray[Any], mean: NDArray[np.float64], celsius: NDArray[np.float64], path: Path
-) -> RawInput:
-    """Take a camera that corrects its ranges itself, or else the sensor of :data:`NOMINAL_RANGE_ERRORS`, as the data say."""
-    words = "nominal intrinsics of 240 x 180 pixels, "
-    plain = _array_info(NOMINAL_CAMERA, np.zeros(3), ())
+def _load(path: Path) -> NDArray[Any]:
+    """Read the array of a ``.npy`` or a ``.npz``, whatever the file is called."""
     try:
-        check_taps(mean, plain, str(path))
+        found = np.load(path, allow_pickle=False)
+        if isinstance(found, np.ndarray):
+            return found
+        with found:
+            names = found.files
+            name = "raw" if "raw" in names else names[0] if len(names) == 1 else ""
+            if name:
+                return np.asarray(found[name])
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as err:
+        raise DataError(f"{path}: cannot read the array: {err}", hint="write it with np.save") from err
+    raise DataError(
+        f"{path}: expected one array, or one that is called raw, got {', '.join(names) or 'none'}",
+        hint="np.savez(path, raw=raw)",
+    )
+
+
+def _without_rig(taps: NDArray[np.float64], plain: TofInfo, path: Path, which: str) -> tuple[TofInfo, str]:
+    """Take a camera that corrects its ranges itself, or else the sensor of :data:`NOMINAL_RANGE_ERRORS`, as the data say."""
+    try:
+        check_taps(taps, plain, path, which)
     except DataError as err:
-        known = _array_info(NOMINAL_CAMERA, np.zeros(3), NOMINAL_RANGE_ERRORS)
+        known = replace(plain, range_errors=NOMINAL_RANGE_ERRORS)
         try:
-            check_taps(mean, known, str(path))
+            check_taps(taps, known, path, which)
         except DataError:
             raise err from None
-        return RawInput(raw, celsius, known, NOMINAL_CAMERA, words + "range errors of a known sensor")
-    return RawInput(raw, celsius, plain, NOMINAL_CAMERA, words + "no range errors")
+        return known, "range errors of a known sensor"
+    return plain, "no range errors"
 
 
 def _check_shape(raw: NDArray[Any], camera: Camera, path: Path) -> None:
@@ -136,11 +232,43 @@ def _check_shape(raw: NDArray[Any], camera: Camera, path: Path) -> None:
     elif fine and shape == (8, h, w):
         hint = "counts as the sensor gives them, such as uint16"
     expected = f"(8, {h}, {w}) or (F, 8, {h}, {w})"
-    got = raw.shape[1:] if len(raw) == 1 else raw.shape
+    got = raw.shape[1:] if raw.shape[:1] == (1,) else raw.shape
     raise DataError(f"{path}: expected numbers of shape {expected}, got {raw.dtype} {got}", hint=hint)
 
 
-def check_taps(raw: NDArray[np.float64], info: TofInfo, where: str) -> None:
+def expect_finite(raw: NDArray[Any], where: str) -> None:
+    """Refuse taps that are NaN or infinite: a network would spread them over the whole image.
+
+    Raises
+    ------
+    DataError
+        Some are.
+    """
+    if not (finite := np.isfinite(raw)).all():
+        raise DataError(
+            f"{where}: expected finite numbers, got {np.count_nonzero(~finite)} others",
+            hint="choose another --frame, or give missing pixels the saturation value: they count as not measured",
+        )
+
+
+def _check_unit(raw: NDArray[Any], saturation: float, path: Path) -> str:
+    """Refuse counts that this sensor cannot give; say what is suspicious, but a dark frame has low counts too."""
+    largest = float(raw[np.isfinite(raw)].max())
+    bits = math.ceil(math.log2(max(largest, 1) + 1))
+    if largest > saturation:
+        raise DataError(
+            f"{path}: expected counts of a sensor that saturates at {saturation:g}, got values up to {largest:g}",
+            hint=f"--saturation COUNTS says where yours does ({2**bits - 1} with {bits} bits)",
+        )
+    if not 1 < largest <= _SUSPICIOUS * saturation:
+        return ""
+    return (
+        f"{path}: no count exceeds {largest:g}. That is right for a dark scene of a sensor that saturates at {saturation:g}; "
+        f"if yours has fewer bits, say so: --saturation {2**bits - 1} for {bits} bits"
+    )
+
+
+def check_taps(raw: NDArray[np.float64], info: TofInfo, path: Path, which: str = "") -> None:
     """Refuse taps that cannot be what ``info`` says: other units, other channels, no signal.
 
     Taps half a period apart add up to twice the offset, so ``C_0 - C_1 + C_2 - C_3`` vanishes for the right order; ranges of both
@@ -154,14 +282,15 @@ def check_taps(raw: NDArray[np.float64], info: TofInfo, where: str) -> None:
         (8, H, W) one frame or the mean of some.
     info
         What they are taken for: four phases of the low frequency, then of the high one.
-    where
-        For the message.
+    path, which
+        File and, within it, frame: for the message.
 
     Raises
     ------
     DataError
         With what was found, and what to try.
     """
+    where = f"{path}{which}"
     _check_counts(raw, info.saturation, where)
     maps, signals = Decoder(info).signals(raw)
     amplitude = np.hypot(signals.phasor[:, 0], signals.phasor[:, 1])
@@ -173,9 +302,10 @@ def check_taps(raw: NDArray[np.float64], info: TofInfo, where: str) -> None:
         raw[:, bright], amplitude[:, bright], signals.gap[bright], maps.depth[bright], info
     )
     if found:
+        hint = f"tofcapture calibrate phase-order {path} says what the channels are; reorder them"
         raise DataError(
             f"{where}: {found}; expected channels: {CHANNELS}",
-            hint=f"tofcapture calibrate phase-order {where} says what the channels are; reorder them",
+            hint=f"{hint}; or take another --frame, or --average, if only this one is so" if which else hint,
         )
 
 
@@ -203,9 +333,12 @@ def _contradiction(
 
 
 def _check_counts(raw: NDArray[np.float64], saturation: float, where: str) -> None:
-    if not np.isfinite(raw).all():
-        raise DataError(f"{where}: expected finite numbers, got {np.count_nonzero(~np.isfinite(raw))} others")
     unit = f"counts of a sensor that saturates at {saturation:g}"
+    if raw.max() <= 0:
+        raise DataError(
+            f"{where}: expected {unit}, got none above 0: no light",
+            hint="choose another --frame if there are more",
+        )
     if raw.max() <= 1:
         raise DataError(
             f"{where}: expected {unit}, got values up to {raw.max():.3g}",
@@ -215,7 +348,7 @@ def _check_counts(raw: NDArray[np.float64], saturation: float, where: str) -> No
     if share > 0.5:
         raise DataError(
             f"{where}: expected {unit}, got {share:.0%} of the pixels at or beyond it",
-            hint="scale counts of more than 12 bits to 12; an overexposed frame holds no phase",
+            hint="an overexposed frame holds no phase: expose shorter, or choose another --frame; or say --saturation",
         )
 
 
@@ -229,18 +362,14 @@ def _from_h5(path: Path, view: int) -> RawInput:
         with h5py.File(path, "r") as file:
             kind = str(file.attrs.get("format", ""))
     except OSError as err:
-        hint = (
-            f"tofcapture check {path}"
-            if path.suffix == ".h5"
-            else "a view file or a shard (.h5), or an array (.npy)"
-        )
+        hint = f"tofcapture check {path}" if path.suffix == ".h5" else _KINDS
         raise DataError(f"{path}: cannot read the file: {err}", hint=hint) from err
     if kind != "tofcapture-shard":
         found = read_view(path)
-        return RawInput(found.tof.raw, found.tof.celsius, found.tof.info, found.rig.tof)
+        return RawInput(found.tof.raw, found.tof.celsius, found.tof.info, found.rig.tof, str(path))
     with ShardReader(path) as shard:
         if not 0 <= view < shard.views:
             raise ConfigError(f"{path}: expected a view of 0 to {shard.views - 1}, got {view}")
         raw = np.stack([shard.raw(view, f) for f in range(shard.frames)])
         celsius = np.array([shard.celsius(view, f) for f in range(shard.frames)])
-        return RawInput(raw, celsius, shard.info, shard.camera)
+        return RawInput(raw, celsius, shard.info, shard.camera, str(path))

@@ -1,13 +1,18 @@
 """The paper's tables by one command: several methods, several runs of each, on one dataset; see docs/network.md.
 
-``results.json`` holds every number; ``tables.md``, ``tables.tex`` and ``tables.html`` beside it hold what the suite prints.
+``results.json`` holds every number; ``tables.md``, ``tables.tex`` and ``tables.html`` beside it hold what the suite prints;
+``results.runs.json`` holds each run as soon as it is measured, for the next call.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import statistics
+import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,13 +20,16 @@ import torch
 from torch import Tensor
 
 from tofcapture.errors import ConfigError
+from tofcapture.files.manifest import manifest_path
+from tofcapture.files.seal import sha256_of
 from tofcapture_model.baselines import lf2, sensor
 from tofcapture_model.baselines.protocol import Baseline
 from tofcapture_model.checkpoint import find_model, load_model
+from tofcapture_model.config import Losses
 from tofcapture_model.data import FrameDataset, batched, spare_memory
-from tofcapture_model.evaluate import write_results
+from tofcapture_model.evaluate import expect_writable, not_new_of, take_scenes, write_results
 from tofcapture_model.frame import Frame, Target, frame_to, target_to
-from tofcapture_model.learned import not_new, origin, sentence
+from tofcapture_model.learned import origin, sentence
 from tofcapture_model.measures import Precision, Uncertainty, regions
 from tofcapture_model.metrics import Score
 from tofcapture_model.run_card import budget
@@ -33,13 +41,17 @@ FREE = {"sensor": sensor.estimate, "lf2": lf2.estimate}
 
 
 class Answer(NamedTuple):
-    """Depth, normals, where the method answers by itself, and what it says of its error; ``scaled``: that is in metres."""
+    """Depth, normals, where the method answers by itself, and what it says of its error; ``scaled``: that is one sigma in metres, not another measure of it."""
 
     depth: Tensor
     normals: Tensor
     measured: Tensor
     sigma: Tensor
     scaled: bool
+
+
+Rows = dict[str, dict[str, Any]]
+"""What is measured, by method or by what tells a run from others."""
 
 
 class Measured:
@@ -67,6 +79,56 @@ class Measured:
         return {**whole, "regions": named, "extra": extra}
 
 
+class Kept:
+    """Rows of measured runs in a file, for the next call under the same conditions: the same frames, code and device.
+
+    Parameters
+    ----------
+    path
+        JSON; what it holds of other conditions is dropped by the first row that is added. ``None`` keeps nothing.
+    conditions
+        All that a row depends on but its network.
+    """
+
+    def __init__(self, path: Path | None, conditions: Mapping[str, Any]) -> None:
+        self.path = path
+        self._head = {"format": "tofcapture-runs", "version": 1, "conditions": dict(conditions)}
+        self.rows = self._read()
+
+    def _read(self) -> Rows:
+        try:
+            table = json.loads(self.path.read_text(encoding="utf-8")) if self.path else {}
+        except (OSError, ValueError):  # none yet, or not ours
+            return {}
+        rows = table.pop("rows", {}) if isinstance(table, dict) else {}
+        return rows if table == self._head else {}
+
+    def add(self, rows: Rows) -> None:
+        """Keep rows, by the network's digest or the method's name."""
+        self.rows |= rows
+        if self.path:
+            write_results(self.path, {**self._head, "rows": self.rows})
+
+
+def _conditions(dataset: Path, split: str, frames: int, scenes: str, device: str) -> dict[str, Any]:
+    return {
+        "manifest_sha256": sha256_of(manifest_path(dataset)),
+        "split": split,
+        "frames": frames,
+        "scenes": scenes,
+        "device": device,
+        "code_sha256": _code_digest(),
+        "torch": str(torch.__version__),
+    }
+
+
+def _code_digest() -> str:
+    """SHA-256 of all sources that numbers may depend on."""
+    folders = [Path(str(files(package))) for package in ("tofcapture", "tofcapture_model")]
+    sources = [path.read_bytes() for folder in folders for path in sorted(folder.rglob("*.py"))]
+    return hashlib.sha256(b"".join(sources)).hexdigest()
+
+
 def read_weights(pairs: Sequence[str]) -> dict[str, list[Path]]:
     """Read ``NAME=PATH`` pairs; a name that comes twice is one method with two runs."""
     out: dict[str, list[Path]] = {}
@@ -89,14 +151,15 @@ def _free(name: str) -> Callable[[Frame], Answer]:
     return answer
 
 
-def _learned(model: Model) -> Callable[[Frame], Answer]:
+def _learned(model: Model, losses: Losses) -> Callable[[Frame], Answer]:
     own = not isinstance(model, Baseline)
+    sigma = own and losses.uncertainty == "laplace"  # the paper's is an expected absolute error
 
     def answer(frame: Frame) -> Answer:
         found = model(frame)
         amplitude = torch.nn.functional.interpolate(frame.confidence, scale_factor=2, mode="nearest")
         everywhere = torch.isfinite(found.depth)
-        return Answer(found.depth, found.normals, everywhere, found.error if own else -amplitude, scaled=own)
+        return Answer(found.depth, found.normals, everywhere, found.error if own else -amplitude, scaled=sigma)
 
     return answer
 
@@ -124,7 +187,7 @@ def measure(
             progress(i + 1, len(data.samples))
     for one in found.values():
         one.precision.close()
-    return {name: one.table() for name, one in found.items()}
+    return {name: _finite(one.table()) for name, one in found.items()}
 
 
 def averaged(runs: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -155,7 +218,7 @@ def run_suite(
     device: str = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Measure methods and write ``results.json`` and the suite's tables beside it.
+    """Measure methods and write ``results.json`` and the suite's tables beside it; called again, it takes the runs that are measured.
 
     Parameters
     ----------
@@ -170,8 +233,17 @@ def run_suite(
     -------
     What was written; lengths in metres.
     """
+    out = Path(out)
+    expect_writable(out)
     results = measure_runs(
-        dataset, weights, split=split, frames=frames, scenes=scenes, device=device, progress=progress
+        dataset,
+        weights,
+        split=split,
+        frames=frames,
+        scenes=scenes,
+        device=device,
+        kept=out.with_name(f"{out.stem}.runs.json"),
+        progress=progress,
     )
     return write_suite(results, suite, out)
 
@@ -184,6 +256,7 @@ def measure_runs(
     frames: int = 0,
     scenes: str = "",
     device: str = "cpu",
+    kept: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Measure the methods without parameters and all runs, one network in memory at a time.
@@ -202,6 +275,8 @@ def measure_runs(
         Only scenes whose name begins so.
     device
         Torch device.
+    kept
+        File that holds every run as soon as it is measured, and gives it back to the next call (:class:`Kept`); ``None``: none.
     progress
         Called with (done, all).
 
@@ -212,35 +287,45 @@ def measure_runs(
     Raises
     ------
     ConfigError
-        No scene of the split begins so, or weights that are not there.
+        No scene of the split begins so, or a network that does not fit the camera.
+    FormatError
+        Weights that are not there.
     """
     place = torch.device(device)
     runs = [(name, i, find_model(path)) for name, paths in weights.items() for i, path in enumerate(paths)]
-    for _, _, path in runs:
-        load_model(path)  # says what is wrong with it, before hours of measuring
     data = FrameDataset(dataset, split, frames=frames, cache_bytes=spare_memory())  # every run asks again
-    data.samples = [s for s in data.samples if s.scene.startswith(scenes)]
-    if not data.samples:
-        raise ConfigError(
-            f"--scenes {scenes}: no scene of the split {split} begins so", hint=", ".join(data.readers)
-        )
+    measured = take_scenes(data, split, scenes)
     count = len(data.samples)
+    _expect_fit([(name, path) for name, _, path in runs], data, place)
+    known = Kept(kept, _conditions(dataset, split, frames, scenes, device))
 
     def part(nth: int) -> Callable[[int, int], None]:
         return lambda done, _all: progress(nth * count + done, (len(runs) + 1) * count) if progress else None
 
-    rows = measure(data, {name: _free(name) for name in FREE}, place, part(0))
-    table = {name: averaged([row]) for name, row in rows.items()}
+    def rows(nth: int, keys: Mapping[str, str], methods: Mapping[str, Callable[[Frame], Answer]]) -> Rows:
+        if all(key in known.rows for key in keys.values()):
+            where = known.path or "an equal run"
+            print(f"{', '.join(keys)}: measured before, taken from {where}", file=sys.stderr, flush=True)
+            part(nth)(count, count)
+        else:
+            found = measure(data, methods, place, part(nth))
+            known.add({keys[name]: row for name, row in found.items()})
+        return {name: known.rows[key] for name, key in keys.items()}
+
+    free = rows(0, {name: name for name in FREE}, {name: _free(name) for name in FREE})
+    table = {name: averaged([row]) for name, row in free.items()}
     trained: dict[str, Any] = {}
     by_name: dict[str, list[dict[str, Any]]] = {}
     for nth, (name, i, path) in enumerate(runs, 1):
-        model, _, provenance = load_model(path)
+        model, config, provenance = load_model(path)
+        digest = sha256_of(path)
         trained[f"{name}#{i}"] = {
             "weights": str(path),
+            "sha256": digest,
             "training": origin(provenance),
-            "not_new": not_new(provenance, dataset, split),
+            "not_new": not_new_of(provenance, dataset, split, measured),
         }
-        row = measure(data, {name: _learned(model.to(place))}, place, part(nth))[name]
+        row = rows(nth, {name: digest}, {name: _learned(model.to(place), config.losses)})[name]
         by_name.setdefault(name, []).append({**row, "budget": budget(provenance)})
     data.close()
     table |= {name: averaged(found) for name, found in by_name.items()}
@@ -249,7 +334,7 @@ def measure_runs(
         "version": 1,
         "dataset": str(dataset),
         "split": split,
-        "scenes": sorted({s.scene for s in data.samples}),
+        "scenes": measured,
         "views": len({(s.scene, s.view) for s in data.samples}),
         "frames": count,
         "units": "m",
@@ -257,6 +342,17 @@ def measure_runs(
         "methods": {name: mean for name, (mean, _) in table.items()},
         "spread": {name: spread for name, (_, spread) in table.items() if len(weights.get(name, ())) > 1},
     }
+
+
+@torch.no_grad()
+def _expect_fit(runs: Sequence[tuple[str, Path]], data: FrameDataset, place: torch.device) -> None:
+    """Have every network answer one frame, so that what is wrong with it is said before hours of measuring."""
+    frame = frame_to(batched(data.frame(data.samples[0])), place)
+    for name, path in runs:
+        try:
+            load_model(path)[0].to(place)(frame)
+        except ConfigError as err:
+            raise ConfigError(f"{name}={path}: {err.message}", hint=err.hint) from err
 
 
 def seen_before(results: Mapping[str, Any]) -> str:

@@ -14,7 +14,7 @@ from tofcapture.files.seal import write_text
 
 @dataclass(frozen=True)
 class Column:
-    """Words, where the number is in a method's results, factor into the printed unit, digits; ``best``: ``least``, ``most`` or ``none``."""
+    """Words, where the number is in a method's results, factor into the printed unit, digits, and which is ``best``: a key of ``RANKS``."""
 
     words: str
     path: tuple[str, ...]
@@ -60,7 +60,7 @@ def _by_region(*names: str) -> tuple[Column, ...]:
 _QUALITY = (
     *_by_region("edge", "interior"),
     Column("precision mm", ("extra", "precision")),
-    Column("within 1 sigma %", ("extra", "coverage_1sigma"), 100, 1, best="most"),
+    Column("within 1 sigma %", ("extra", "coverage_1sigma"), 100, 1, best="one sigma"),
     Column("AUSE", ("extra", "ause"), 1, 3),
     Column("coverage %", ("depth", "pixel", "coverage"), 100, 1, best="most"),
 )
@@ -123,25 +123,30 @@ def cells(results: Mapping[str, Any], suite: Suite) -> list[tuple[str, list[tupl
     return [(suite.rows.get(name, name), [column[i] for column in columns]) for i, name in enumerate(methods)]
 
 
-_BEST: Mapping[str, Callable[..., float]] = {
-    "least": min,
-    "most": max,
-    "none": lambda _values, default: default,
+ONE_SIGMA_PCT = 68.27  # of the errors lie within one sigma, if it is right
+
+RANKS: Mapping[str, Callable[[float], float]] = {
+    "least": abs,
+    "most": lambda value: -value,
+    "one sigma": lambda value: abs(value - ONE_SIGMA_PCT),
+    "none": lambda _value: math.nan,
 }
+"""What is smallest for the best value of a column; NaN where none is better."""
 
 
 def _column(methods: Mapping[str, Any], spread: Mapping[str, Any], column: Column) -> list[tuple[str, bool]]:
     values = [_value(table, column) for table in methods.values()]
-    known = [abs(v) for v in values if v is not None]
-    best = _BEST[column.best](known, default=math.nan)
+    # what looks equal in print is equal
+    ranks = [math.nan if v is None else RANKS[column.best](round(v, column.digits)) for v in values]
+    known = [r for r in ranks if not math.isnan(r)]
     out = []
-    for name, value in zip(methods, values, strict=True):
+    for name, value, rank in zip(methods, values, ranks, strict=True):
         if value is None:
             out.append(("–", False))
             continue
         other = _value(spread.get(name, {}), column)
         text = f"{value:.{column.digits}f}" + ("" if other is None else f" ± {other:.{column.digits}f}")
-        out.append((text, len(known) > 1 and abs(value) == best))
+        out.append((text, len(known) > 1 and rank == min(known)))
     return out
 
 
@@ -161,20 +166,31 @@ def _markdown(results: Mapping[str, Any], suite: Suite) -> str:
 
 
 def _joined(row: Sequence[str]) -> str:
-    return "| " + " | ".join(row) + " |"
+    return "| " + " | ".join(text.replace("|", r"\|") for text in row) + " |"
+
+
+_LATEX = str.maketrans(
+    {
+        **{sign: rf"\{sign}" for sign in "%_&#${}"},
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "\\": r"\textbackslash{}",
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "|": r"\textbar{}",
+        "±": r"$\pm$",
+        "–": "--",
+    }
+)
 
 
 def _latex(results: Mapping[str, Any], suite: Suite) -> str:
-    def line(row: Sequence[str]) -> str:
-        safe = (
-            x.replace("%", r"\%").replace("_", r"\_").replace("±", r"$\pm$").replace("–", "--") for x in row
-        )
-        return " & ".join(safe) + r" \\"
+    def line(row: Sequence[tuple[str, bool]]) -> str:
+        safe = [(text.translate(_LATEX), best) for text, best in row]
+        return " & ".join(rf"\textbf{{{text}}}" if best else text for text, best in safe) + r" \\"
 
-    rows = [
-        line([name, *(rf"\textbf{{{t}}}" if b else t for t, b in row)]) for name, row in cells(results, suite)
-    ]
-    head = line(["method", *(c.words for c in suite.columns)])
+    rows = [line([(name, False), *row]) for name, row in cells(results, suite)]
+    head = line([(words, False) for words in ("method", *(c.words for c in suite.columns))])
     start = rf"\begin{{tabular}}{{l{'r' * len(suite.columns)}}}"
     return "\n".join(
         [f"% {suite.title}", start, r"\hline", head, r"\hline", *rows, r"\hline", r"\end{tabular}", ""]

@@ -210,7 +210,7 @@ def doubts(sources: Sources) -> list[str]:
     """What a reader must know before believing that the parts of the page belong together."""
     out = []
     results, network = sources.results, sources.network
-    if results and network and results.get("training") not in (None, origin(network.provenance)):
+    if results and network and _other_weights(results, network):
         out.append("The pictures are made with other weights than the table.")
     trained_on = network.provenance.get("manifest_sha256") if network else None
     if trained_on and sources.manifest_sha256 and trained_on != sources.manifest_sha256:
@@ -220,11 +220,36 @@ def doubts(sources: Sources) -> list[str]:
             else "The network was trained on another dataset, or on another state of this one."
         )
     if results and sources.manifest and "scenes" in results:
-        scenes = sorted(sources.manifest.split(str(results["split"])))
-        if scenes != sorted(results["scenes"]):
+        scenes = sources.manifest.split(str(results["split"]))
+        some = set(results["scenes"])
+        if some < set(scenes):
+            out.append(
+                f"The table was measured on {len(some)} of the {len(scenes)} scenes of this dataset's split."
+            )
+        elif some != set(scenes):
             out.append("The table was measured on other scenes than this dataset's split holds.")
-    if results and results.get("not_new"):
-        out.append(sentence("The network", results["not_new"], len(results["scenes"])) + ".")
-    elif results and results.get("split") == "train" and results.get("not_new") is None:
-        out.append("The table may have been measured on what the network was trained on: the split train.")
+    return out + (_not_new(results) if results else [])
+
+
+def _runs(results: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """What is known of every network of a result: one without a suite, a suite's runs."""
+    return dict(results["runs"]) if "runs" in results else {"The network": results}
+
+
+def _other_weights(results: Mapping[str, Any], network: Network) -> bool:
+    trainings = [run.get("training") for run in _runs(results).values()]
+    return None not in trainings and origin(network.provenance) not in trainings
+
+
+def _not_new(results: Mapping[str, Any]) -> list[str]:
+    """A sentence for every network that has learned from some of the scenes, or may have."""
+    out = []
+    for who, run in _runs(results).items():
+        if "not_new" in run:
+            said = sentence(who, run["not_new"], len(results["scenes"]))
+            out += [f"{said}."] if said else []
+        elif results["split"] == "train":
+            out.append(
+                "The table may have been measured on what the network was trained on: the split train."
+            )
     return out

@@ -120,15 +120,29 @@ def _rank(value: float, better: str) -> float | None:
     return {"less": value, "more": -value, "nearer": abs(value)}[better]
 
 
+def networks(results: Mapping[str, Any]) -> list[str]:
+    """Methods that headline and tiles are about: the networks, or where there are none what stands beside the sensor."""
+    methods = [name for name in results["methods"] if name != "sensor"]
+    learned = {"model", *(key.rpartition("#")[0] for key in results.get("runs", {}))}
+    return [name for name in methods if name in learned] or methods
+
+
 def headline(results: Mapping[str, Any]) -> str:
-    """One sentence: what the network makes of the sensor's error."""
+    """What becomes of the sensor's error: a sentence for every network."""
     where = f"On {sample(results)}"
-    pair = {m: _two(results, m) for m in ("sensor", "model")}
-    if None in [v for two in pair.values() for v in two]:
-        return f"{where}: there is nothing to compare."
-    (d0, n0), (d1, n1) = pair["sensor"], pair["model"]
+    told = " ".join(filter(None, (_compared(results, name) for name in networks(results))))
+    return f"{where}, {told}" if told else f"{where}: there is nothing to compare."
+
+
+def _compared(results: Mapping[str, Any], name: str) -> str:
+    (d0, n0), (d1, n1) = _two(results, "sensor"), _two(results, name)
+    if None in (d0, n0, d1, n1):
+        return ""
+    who = "the network" if name == "model" else name
+    runs = [key for key in results.get("runs", {}) if key.rpartition("#")[0] == name]
+    mean = f" (mean of {len(runs)} runs)" if len(runs) > 1 else ""
     return (
-        f"{where}, the network's depth is {d1:.2f} mm off on average where the ToF sensor is {d0:.2f} mm off "
+        f"{who}{mean} is {d1:.2f} mm off in depth on average where the ToF sensor is {d0:.2f} mm off "
         f"({_change(d0, d1)}); its normals are {n1:.1f} degrees off instead of {n0:.1f} ({_change(n0, n1)})."
     )
 
@@ -156,8 +170,10 @@ def _count(number: object, noun: str) -> str:
 
 
 def tiles(results: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """(what, number with unit, the sensor's number) of the main metrics, pooled over pixels."""
-    sensor, model = (results["methods"].get(m, {}) for m in ("sensor", "model"))
+    """(what, number with unit, whose it is and the sensor's) of the main metrics, pooled over pixels; of several networks the best."""
+    names = networks(results)
+    if not names:
+        return []
     wanted = [
         ("depth error, mean", "depth", DEPTH[0]),
         ("depth error, median", "depth", DEPTH[1]),
@@ -166,6 +182,21 @@ def tiles(results: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ]
     out = []
     for title, kind, column in wanted:
-        ours, theirs = (shown(value_of(m, kind, "pixel", column), column) for m in (model, sensor))
-        out.append((title, f"{ours} {column.unit}", f"sensor {theirs} {column.unit}"))
+        values = {
+            m: value_of(results["methods"].get(m, {}), kind, "pixel", column) for m in (*names, "sensor")
+        }
+        best = min(names, key=lambda m: _order(values[m], column))
+        ours, theirs = shown(values[best], column), shown(values["sensor"], column)
+        out.append((title, f"{ours} {column.unit}", f"{_whose(best, names)}sensor {theirs} {column.unit}"))
     return out
+
+
+def _order(value: float | None, column: Column) -> float:
+    rank = None if value is None else _rank(value, column.better)
+    return math.inf if rank is None else rank
+
+
+def _whose(name: str, names: list[str]) -> str:
+    if len(names) > 1:
+        return f"{name}, best of {len(names)}; "
+    return "" if name == "model" else f"{name}; "
