@@ -154,6 +154,7 @@ def main() -> None:
             runs,
             frames=args.frames,
             device=args.device,
+            kept=args.out / "results.runs.json",
             progress=lambda done, total: report("measure", done / total),
         )
     for suite in args.suite:

@@ -16,8 +16,9 @@ from tofcapture.dataset import export as exporting
 from tofcapture.dataset.export import UNIT, check_export, export
 from tofcapture.dataset.export_mcap import image_of, quaternion
 from tofcapture.dataset.export_ply import parse_ply, ply_bytes, ply_points, pose_comment
-from tofcapture.dataset.export_png import png_bytes, quantise
+from tofcapture.dataset.export_png import quantise
 from tofcapture.errors import ConfigError, DataError, FormatError
+from tofcapture.files.png import png_bytes
 from tofcapture.files.shard import ShardReader
 from tofcapture.o3d import load_open3d
 from tofcapture.poses import exp
@@ -181,3 +182,12 @@ def test_the_command(dataset, tmp_path, capsys):
     assert answer["bytes"] == sum(p.stat().st_size for p in (tmp_path / "x/box").iterdir())
     assert main(line) == 0
     assert "0 scenes written" in capsys.readouterr().out
+
+
+def test_png_is_what_a_decoder_reads():
+    """16-bit grey and 8-bit colour survive another library's decoder."""
+    grey = np.random.default_rng(0).integers(0, 65536, (7, 5), dtype=np.uint16)
+    colour = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
+    for image, back in ((grey, slice(None)), (colour, (..., slice(None, None, -1)))):
+        data = np.frombuffer(png_bytes(image), np.uint8)
+        assert (cv2.imdecode(data, cv2.IMREAD_UNCHANGED)[back] == image).all()

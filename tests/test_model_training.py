@@ -27,7 +27,7 @@ from tofcapture_model.config import Network, Stage, preset
 from tofcapture_model.data import FrameDataset, batched
 from tofcapture_model.evaluate import evaluate
 from tofcapture_model.learner import Learner
-from tofcapture_model.predict import png_bytes, predict
+from tofcapture_model.predict import predict
 from tofcapture_model.runlog import Position
 from tofcapture_model.train import _Run, train
 
@@ -274,16 +274,6 @@ def test_predict_writes_every_file_from_a_shard_and_from_an_array(dataset, train
         predict(shard, tmp_path / "out", weights=trained[0], frame=7)
     with pytest.raises(DataError, match="no such file"):
         predict(tmp_path / "nothing.npy", tmp_path / "out", weights=trained[0])
-
-
-def test_png_is_what_a_decoder_reads():
-    """16-bit grey and 8-bit colour survive another library's decoder."""
-    cv2 = pytest.importorskip("cv2")
-    grey = np.random.default_rng(0).integers(0, 65536, (7, 5), dtype=np.uint16)
-    colour = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
-    for image, back in ((grey, slice(None)), (colour, (..., slice(None, None, -1)))):
-        data = np.frombuffer(png_bytes(image), np.uint8)
-        assert (cv2.imdecode(data, cv2.IMREAD_UNCHANGED)[back] == image).all()
 
 
 def test_the_commands_run_and_answer_in_json(dataset, trained, tmp_path, capsys):

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 import statistics
-import struct
 import time
-import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -19,13 +16,13 @@ from torch import Tensor
 
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
-from tofcapture.files.seal import write_text
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoder, frequencies
 from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.config import BASELINES
 from tofcapture_model.data import MAX_RANGE, batched, decode_frame, frame_decoder, make_frame, with_cues
 from tofcapture_model.frame import Frame, frame_to
+from tofcapture_model.prediction import Prediction, write_prediction
 from tofcapture_model.raw_input import RawInput, expect_finite, read_input, taken
 
 Float32 = NDArray[np.float32]
@@ -34,41 +31,6 @@ WARM, RUNS = (
     3,
     7,
 )  # runs before the timed ones, which allocate and wake threads; timed runs, whose median is told
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """What a prediction is, at twice the sensor's resolution.
-
-    Attributes
-    ----------
-    depth
-        (2H, 2W) float32 metres: z.
-    error
-        (2H, 2W) float32 metres: expected absolute error of the depth; ``None`` from a network that predicts none.
-    normals
-        (2H, 2W, 3) float32, unit, ToF frame, facing the camera.
-    measured
-        (2H, 2W) bool: the sensor measured at this pixel; elsewhere the network started from the nearest pixel that did.
-    camera
-        Intrinsics of the (2H, 2W) grid.
-    network
-        Kind of network that answered.
-    inference_ms
-        Median time of the network, after loading and decoding; on a GPU with that of the physical cues; NaN: not timed.
-    decode_ms
-        Median time of decoding the raw frame, after the camera's tables are built, and of the physical cues; on a GPU of decoding and
-        of the way there; NaN: not timed.
-    """
-
-    depth: Float32
-    error: Float32 | None
-    normals: Float32
-    measured: NDArray[np.bool_]
-    camera: Camera
-    network: str
-    inference_ms: float = math.nan
-    decode_ms: float = math.nan
 
 
 class _Watch(Protocol):
@@ -324,69 +286,6 @@ def _onnx_model(weights: Path | None) -> tuple[Ask, str]:
         return depth, normals, error
 
     return ask, config.network.kind
-
-
-def png_bytes(image: NDArray[Any]) -> bytes:
-    """Encode (H, W) uint16 grey or (H, W, 3) uint8 colour as PNG."""
-    grey = image.ndim == 2
-    rows = image.astype(">u2" if grey else np.uint8).reshape(len(image), -1).view(np.uint8)
-    packed = zlib.compress(np.hstack([np.zeros((len(image), 1), np.uint8), rows]).tobytes(), 6)
-    header = struct.pack(
-        ">IIBBBBB", image.shape[1], image.shape[0], 16 if grey else 8, 0 if grey else 2, 0, 0, 0
-    )
-    chunks = ((b"IHDR", header), (b"IDAT", packed), (b"IEND", b""))
-    body = b"".join(
-        struct.pack(">I", len(d)) + t + d + struct.pack(">I", zlib.crc32(t + d)) for t, d in chunks
-    )
-    return b"\x89PNG\r\n\x1a\n" + body
-
-
-def ply_bytes(prediction: Prediction) -> bytes:
-    """Encode points, normals and, where there is one, expected error as binary PLY, metres, ToF frame."""
-    columns: list[NDArray[Any]] = [prediction.camera.unproject(prediction.depth), prediction.normals]
-    names = ["x", "y", "z", "nx", "ny", "nz"]
-    if prediction.error is not None:
-        columns.append(prediction.error[..., None])
-        names.append("expected_error")
-    rows = np.concatenate(columns, axis=-1).reshape(-1, len(names))
-    header = ["ply", "format binary_little_endian 1.0", "comment units m", f"element vertex {len(rows)}"]
-    header += [*(f"property float {n}" for n in names), "end_header", ""]
-    return "\n".join(header).encode() + rows.astype("<f4").tobytes()
-
-
-def write_prediction(prediction: Prediction, out: Path) -> dict[str, str]:
-    """Write a prediction into a folder.
-
-    ``depth.npy``, ``error.npy`` (float32 metres), ``normals.npy``, ``measured.npy`` (bool), ``cloud.ply``, ``depth.png`` (16 bit,
-    unit 0.1 mm, so up to 6.5535 m), ``normals.png`` (8 bit, ``(n + 1) / 2`` with y and z towards the viewer), ``units.txt``. From a
-    network that predicts no error there is no ``error.npy``; one of an earlier prediction is removed.
-
-    Returns
-    -------
-    Path of every file by its name.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "error.npy").unlink(missing_ok=True)
-    arrays = {
-        f"{name}.npy": array
-        for name in ("depth", "normals", "error", "measured")
-        if (array := getattr(prediction, name)) is not None
-    }
-    for name, array in arrays.items():
-        np.save(out / name, array)
-    tenth_mm = np.clip(np.rint(prediction.depth * 1e4), 0, 65535).astype(np.uint16)
-    colours = ((prediction.normals * [1, -1, -1] + 1) * 127.5).clip(0, 255).astype(np.uint8)
-    (out / "depth.png").write_bytes(png_bytes(tenth_mm))
-    (out / "normals.png").write_bytes(png_bytes(colours))
-    (out / "cloud.ply").write_bytes(ply_bytes(prediction))
-    write_text(
-        out / "units.txt",
-        "npy, ply: metres, ToF frame (x right, y down, z forward)\n"
-        "measured.npy: bool, true where the depth stands on a measurement, false where the sensor had none and it was filled\n"
-        "depth.png: 0.1 mm per count\n",
-    )
-    names = (*arrays, "depth.png", "normals.png", "cloud.ply", "units.txt")
-    return {name: str(out / name) for name in names}
 
 
 def _expect_folder(out: Path) -> None:

@@ -159,7 +159,9 @@ def _learned(model: Model, losses: Losses) -> Callable[[Frame], Answer]:
         found = model(frame)
         amplitude = torch.nn.functional.interpolate(frame.confidence, scale_factor=2, mode="nearest")
         everywhere = torch.isfinite(found.depth)
-        return Answer(found.depth, found.normals, everywhere, found.error if own else -amplitude, scaled=sigma)
+        return Answer(
+            found.depth, found.normals, everywhere, found.error if own else -amplitude, scaled=sigma
+        )
 
     return answer
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
-import zlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.errors import DataError
+from tofcapture.files.png import png_bytes
 from tofcapture.files.seal import replacing, write_text
 from tofcapture.files.shard import ShardReader
 
@@ -37,23 +36,6 @@ def quantise(depth: NDArray[np.floating], unit: float, where: str) -> NDArray[np
             hint="--unit 0.001",
         )
     return steps.astype(np.uint16)
-
-
-def png_bytes(image: NDArray[Any], text: dict[str, str]) -> bytes:
-    """Grey PNG of an (H, W) image of uint8 or uint16, with text chunks."""
-    H, W = image.shape
-    rows = image.astype(image.dtype.newbyteorder(">")).view(np.uint8).reshape(H, -1)
-    above = np.vstack([np.zeros_like(rows[:1]), rows[:-1]])
-    lines = np.hstack([np.full((H, 1), _UP, np.uint8), rows - above])
-    parts = [(b"IHDR", struct.pack(">IIBBBBB", W, H, 8 * image.dtype.itemsize, 0, 0, 0, 0))]
-    parts += [
-        (b"tEXt", key.encode("latin-1") + b"\0" + value.encode("latin-1")) for key, value in text.items()
-    ]
-    parts += [(b"IDAT", zlib.compress(lines.tobytes(), 6)), (b"IEND", b"")]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in parts
-    )
 
 
 def export_png(shard: ShardReader, folder: Path, unit: float) -> list[Path]:

@@ -1,0 +1,100 @@
+"""What a prediction is, and the files that hold one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.camera import Camera
+from tofcapture.files.png import png_bytes
+from tofcapture.files.seal import write_text
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a prediction is, at twice the sensor's resolution.
+
+    Attributes
+    ----------
+    depth
+        (2H, 2W) float32 metres: z.
+    error
+        (2H, 2W) float32 metres: expected absolute error of the depth; ``None`` from a network that predicts none.
+    normals
+        (2H, 2W, 3) float32, unit, ToF frame, facing the camera.
+    measured
+        (2H, 2W) bool: the sensor measured at this pixel; elsewhere the network started from the nearest pixel that did.
+    camera
+        Intrinsics of the (2H, 2W) grid.
+    network
+        Kind of network that answered.
+    inference_ms
+        Median time of the network, after loading and decoding; on a GPU with that of the physical cues; NaN: not timed.
+    decode_ms
+        Median time of decoding the raw frame, after the camera's tables are built, and of the physical cues; on a GPU of decoding and
+        of the way there; NaN: not timed.
+    """
+
+    depth: Float32
+    error: Float32 | None
+    normals: Float32
+    measured: NDArray[np.bool_]
+    camera: Camera
+    network: str
+    inference_ms: float = math.nan
+    decode_ms: float = math.nan
+
+
+def ply_bytes(prediction: Prediction) -> bytes:
+    """Encode points, normals and, where there is one, expected error as binary PLY, metres, ToF frame."""
+    columns: list[NDArray[Any]] = [prediction.camera.unproject(prediction.depth), prediction.normals]
+    names = ["x", "y", "z", "nx", "ny", "nz"]
+    if prediction.error is not None:
+        columns.append(prediction.error[..., None])
+        names.append("expected_error")
+    rows = np.concatenate(columns, axis=-1).reshape(-1, len(names))
+    header = ["ply", "format binary_little_endian 1.0", "comment units m", f"element vertex {len(rows)}"]
+    header += [*(f"property float {n}" for n in names), "end_header", ""]
+    return "\n".join(header).encode() + rows.astype("<f4").tobytes()
+
+
+def write_prediction(prediction: Prediction, out: Path) -> dict[str, str]:
+    """Write a prediction into a folder.
+
+    ``depth.npy``, ``error.npy`` (float32 metres), ``normals.npy``, ``measured.npy`` (bool), ``cloud.ply``, ``depth.png`` (16 bit,
+    unit 0.1 mm, so up to 6.5535 m), ``normals.png`` (8 bit, ``(n + 1) / 2`` with y and z towards the viewer), ``units.txt``. From a
+    network that predicts no error there is no ``error.npy``; one of an earlier prediction is removed.
+
+    Returns
+    -------
+    Path of every file by its name.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "error.npy").unlink(missing_ok=True)
+    arrays = {
+        f"{name}.npy": array
+        for name in ("depth", "normals", "error", "measured")
+        if (array := getattr(prediction, name)) is not None
+    }
+    for name, array in arrays.items():
+        np.save(out / name, array)
+    tenth_mm = np.clip(np.rint(prediction.depth * 1e4), 0, 65535).astype(np.uint16)
+    colours = ((prediction.normals * [1, -1, -1] + 1) * 127.5).clip(0, 255).astype(np.uint8)
+    (out / "depth.png").write_bytes(png_bytes(tenth_mm))
+    (out / "normals.png").write_bytes(png_bytes(colours))
+    (out / "cloud.ply").write_bytes(ply_bytes(prediction))
+    write_text(
+        out / "units.txt",
+        "npy, ply: metres, ToF frame (x right, y down, z forward)\n"
+        "measured.npy: bool, true where the depth stands on a measurement, false where the sensor had none and it was filled\n"
+        "depth.png: 0.1 mm per count\n",
+    )
+    names = (*arrays, "depth.png", "normals.png", "cloud.ply", "units.txt")
+    return {name: str(out / name) for name in names}
