@@ -1,0 +1,104 @@
+"""What a training step adds up: which losses of which maps, over which pixels, times which weights."""
+
+# ruff: noqa: E402  torch is optional
+from __future__ import annotations
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from tofcapture_model.chamfer import robust_chamfer
+from tofcapture_model.config import Losses
+from tofcapture_model.frame import Estimate, Target
+from tofcapture_model.geometry import unit, unproject
+from tofcapture_model.losses import (
+    angle_loss,
+    cosine_loss,
+    error_map_loss,
+    laplace_loss,
+    masked_mean,
+    objective,
+    reweighted_smooth_l1,
+)
+
+SHAPE = (12, 16)
+K = torch.tensor([[20.0, 20.0, 7.5, 5.5]] * 2)
+OURS = Losses(
+    reweight=False,
+    uncertainty="laplace",
+    normals="angle",
+    chamfer_distance="plane",
+    chamfer_softness=3.0,
+    **(
+        UNLIKE := {
+            "delta": 0.01,
+            "jitter": 0.004,
+            "depth": 2.0,
+            "error": 3.0,
+            "normal": 5.0,
+            "chamfer": 0.7,
+            "context": 0.25,
+        }
+    ),
+)
+PAPERS = Losses(**UNLIKE)
+
+
+def example():
+    """An estimate whose maps before and after refinement are unlike, a target with pixels that are good, context and neither."""
+    g = torch.Generator().manual_seed(0)
+    truth = 0.5 + 0.1 * torch.rand(2, 1, *SHAPE, generator=g)
+    kind = torch.randint(3, truth.shape, generator=g)
+    first, fine = (truth + 0.004 + 0.01 * torch.randn(truth.shape, generator=g) for _ in range(2))
+    error = 0.002 + 0.02 * torch.rand(truth.shape, generator=g)
+    normals = [unit(torch.randn(2, 3, *SHAPE, generator=g)) for _ in range(3)]
+    return Estimate(fine, normals[0], error, first, normals[1]), Target(
+        truth, normals[2], kind == 0, kind == 1
+    )
+
+
+@pytest.mark.parametrize("weights", [OURS, PAPERS], ids=["ours", "paper's"])
+@pytest.mark.parametrize(
+    ("stage", "refined", "parts"),
+    [
+        ("depth", False, {"depth", "error", "chamfer"}),
+        ("normal", False, {"normal"}),
+        ("refine", True, {"depth", "normal"}),
+        ("joint", True, {"depth", "error", "chamfer", "normal"}),
+    ],
+)
+def test_every_part_is_its_loss_of_the_stage_s_maps_times_its_weight(weights, stage, refined, parts):
+    """Before refinement in the first two stages, after it in the others; over good pixels and, with its weight, context; Chamfer in mm^2 over good ones."""
+    estimate, target = example()
+    depth = estimate.depth if refined else estimate.initial_depth
+    normals = estimate.normals if refined else estimate.initial_normals
+    truth, error = target.depth, estimate.error
+    weight = target.good + weights.context * target.context
+    lambda_error = error if weights.reweight else truth
+    uncertainty, angles = (laplace_loss, angle_loss) if weights is OURS else (error_map_loss, cosine_loss)
+    clouds = unproject(depth, K), unproject(truth, K), target.good, target.good, K, weights.jitter
+    plane = {"normals": target.normals, "softness": 3e-6} if weights is OURS else {}
+    expected = {
+        "depth": weights.depth * reweighted_smooth_l1(depth, truth, lambda_error, weight, weights.delta),
+        "error": weights.error * uncertainty(error, depth, truth, weight, weights.delta),
+        "chamfer": weights.chamfer * (1e3**2 * robust_chamfer(*clouds, **plane).loss).mean(),
+        "normal": weights.normal * angles(normals, target.normals, weight),
+    }
+    found = objective(weights, stage, estimate, target, K)
+    assert found.parts.keys() == parts
+    for name in parts:
+        torch.testing.assert_close(found.parts[name], expected[name])
+    torch.testing.assert_close(found.total, sum(expected[name] for name in parts))
+    assert found.winners.sum() == (len(truth) if "chamfer" in parts else 0)
+
+
+def test_a_part_without_weight_costs_nothing():
+    """Chamfer is not even computed, which would take the longest."""
+    estimate, target = example()
+    assert "chamfer" not in objective(Losses(chamfer=0.0), "joint", estimate, target, K).parts
+
+
+def test_masked_means_weigh_pixels():
+    """A pixel of weight 1/4 counts a quarter in the sum and in the count; one of weight 0 may be NaN."""
+    values, weight = torch.tensor([1.0, 3.0, float("nan")]), torch.tensor([1.0, 0.25, 0.0])
+    assert masked_mean(values, weight).item() == pytest.approx((1 + 0.25 * 3) / (1 + 0.25))
