@@ -15,6 +15,7 @@ from tofcapture.errors import ConfigError
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.baselines import lf2
 from tofcapture_model.baselines.coarse_fine import CoarseFine
+from tofcapture_model.baselines.decoding import decode
 from tofcapture_model.baselines.guo2018 import MRM
 from tofcapture_model.baselines.protocol import Baseline
 from tofcapture_model.baselines.sensor import upsample_depth
@@ -141,7 +142,7 @@ def test_turning_both_phasors_moves_the_depth_along_its_ray():
         turn(high, data.phasor[:, 2:]), torch.full_like(data.depth, angle), atol=1e-4, rtol=0
     )
     length = rays(data.intrinsics, 36, 44).norm(dim=1, keepdim=True)
-    depth, gap = lf2.decode(data, low, high)
+    depth, gap = decode(data, low, high)
     moved = (depth - data.depth) * length
     expected = angle * SPEED_OF_LIGHT / (4 * math.pi * 100e6)
     torch.testing.assert_close(moved, torch.full_like(moved, expected), atol=1e-5, rtol=0)
@@ -154,27 +155,27 @@ def test_decoding_again_is_decoding():
         measured(frame(), *wall(frame(), 2.0, 0.05)),
         measured(frame(), *wall(frame(), 5.0, 0.05, 1)),
     )
-    depth, gap = lf2.decode(data, *after.phasor.chunk(2, dim=1))
+    depth, gap = decode(data, *after.phasor.chunk(2, dim=1))
     length = rays(data.intrinsics, 36, 44).norm(dim=1, keepdim=True)
     full = 2 * math.pi * metres_per_radian(data, 0)
     apart = (depth - after.depth) * length / full
     assert (apart - apart.round()).abs().max() < 1e-5  # in ranges of the low frequency
     torch.testing.assert_close(gap, after.gap, atol=1e-4, rtol=0)
-    assert torch.equal(lf2.decode(data, *data.phasor.chunk(2, dim=1))[0], data.depth)
+    assert torch.equal(decode(data, *data.phasor.chunk(2, dim=1))[0], data.depth)
 
 
 def test_a_hole_keeps_its_wraps():
     """Its gap says nothing of the depth that was filled in."""
     data = frame()
     data = data._replace(valid=torch.zeros_like(data.valid), gap=torch.full_like(data.gap, 0.76))
-    assert torch.equal(lf2.decode(data, *data.phasor.chunk(2, dim=1))[0], data.depth)
+    assert torch.equal(decode(data, *data.phasor.chunk(2, dim=1))[0], data.depth)
 
 
 def test_a_dark_pixel_has_a_finite_gradient():
     """atan2 at zero would give NaN, which one dark pixel would spread over all weights."""
     data = frame(batch=1)
     phasor = torch.zeros_like(data.phasor).requires_grad_()
-    lf2.decode(data, *phasor.chunk(2, dim=1))[0].sum().backward()
+    decode(data, *phasor.chunk(2, dim=1))[0].sum().backward()
     assert torch.isfinite(phasor.grad).all()
 
 

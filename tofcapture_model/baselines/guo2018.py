@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from tofcapture_model.baselines import lf2
+from tofcapture_model.baselines.decoding import decode
 from tofcapture_model.baselines.protocol import Baseline
 from tofcapture_model.frame import Estimate, Frame, Target, expect_channels
 from tofcapture_model.losses import masked_mean
@@ -78,7 +78,7 @@ class MRM(Baseline):
         with torch.autocast(frame.raw.device.type, enabled=False):
             mixed = torch.einsum("bcihw,bchw->bihw", kernels, frame.raw)
             low, high = torch.einsum("bpc,bchw->bphw", frame.demodulation, mixed).chunk(2, dim=1)
-        return lf2.decode(frame, low, high)[0]
+        return decode(frame, low, high)[0]
 
     def kernels(self, raw: Tensor) -> Tensor:
         """(B, C, C, H, W) mixing matrices about the identity: an untrained network changes nothing."""
