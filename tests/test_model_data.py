@@ -190,3 +190,25 @@ def test_the_command_trains_on_several_datasets(dataset, other, tmp_path, capsys
     assert f"tofcapture train {dataset} {other} --out" in card
     assert main(["train", str(dataset), *out]) == 3
     assert "another configuration, dataset, budget" in capsys.readouterr().out
+
+
+def test_a_mean_measures_nothing_where_a_shot_is_saturated(dataset, monkeypatch):
+    """Clipping took from that mean what nobody knows; the other pixels stay as they are."""
+    data = FrameDataset(dataset, "train", mean=True)
+    sample = data.samples[0]
+    reader = data.readers[sample.scene]
+    before = data.frame(sample)
+    assert data.averaged > 1
+    assert before.valid[0, 10, 20] == 1
+    raw = type(reader).raw
+
+    def dazzled(self, view, shot):
+        taps = np.array(raw(self, view, shot))
+        if shot == 0:
+            taps[3, 10, 20] = self.info.saturation
+        return taps
+
+    monkeypatch.setattr(type(reader), "raw", dazzled)
+    after = data.frame(sample)
+    assert after.valid[0, 10, 20] == 0
+    assert (after.valid != before.valid).sum() == 1

@@ -26,6 +26,7 @@ from tofcapture.ops.phase.float32 import tap_weights
 from tofcapture_model.augment import BurstNoise
 from tofcapture_model.frame import NO_MAPS, Frame, Target
 from tofcapture_model.multipath import cues
+from tofcapture_model.raw_input import taken
 from tofcapture_model.shards import SampleId, all_samples, open_scenes
 
 Float32 = NDArray[np.float32]
@@ -229,12 +230,13 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         if sample in self._frames:
             return self._frames[sample]
         reader = self.readers[sample.scene]
-        taken = range(self.averaged) if self.mean else [sample.frame]
-        celsius = float(np.mean([reader.celsius(sample.view, f) for f in taken]))
+        shots = range(self.averaged) if self.mean else [sample.frame]
+        celsius = np.array([reader.celsius(sample.view, f) for f in shots])
+        burst = np.stack([reader.raw(sample.view, f) for f in shots])
+        raw, temperature = taken(burst, None if self.mean else 0, reader.info.saturation, celsius)
         if sample.scene not in self._decoders:
             self._decoders[sample.scene] = frame_decoder(reader.info, reader.camera)
-        raw: NDArray[Any] = np.stack([reader.raw(sample.view, f) for f in taken]).mean(0, dtype=np.float32)
-        frame = make_frame(raw, reader.info, reader.camera, celsius, self._decoders[sample.scene])
+        frame = make_frame(raw, reader.info, reader.camera, temperature, self._decoders[sample.scene])
         if self._take_room(frame):
             self._frames[sample] = frame
         return frame
