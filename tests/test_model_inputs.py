@@ -24,7 +24,7 @@ from tofcapture_model.geometry import (
     unit,
 )
 from tofcapture_model.metrics import angles_deg
-from tofcapture_model.multipath import STEP, bounce_error, cues, exchange_error, halo_error, surface
+from tofcapture_model.multipath import STEP, cues, exchange_error, halo_error, surface
 from tofcapture_model.networks import CUE_SCALE, FIT_RADII, CompactInputs, Raw2Depth, Raw2Normal
 
 RATIO, CUES, SMOOTH = 6, slice(9, 13), 16
@@ -145,9 +145,10 @@ def test_cues_come_in_their_order():
     high = amplitude * torch.cat([(30 * depth).cos(), (30 * depth).sin()], dim=1)
     low = torch.cat([amplitude, nothing], dim=1)
     found = cues(torch.cat([low, high], dim=1), depth, valid, nothing + 0.02, K, HZ)
+    maps = surface(depth, valid, amplitude, K)
     expected = [
-        bounce_error(depth, valid, amplitude, K, HZ),
-        bounce_error(depth, valid, amplitude, K, HZ, step=2 * STEP, margin=3),
+        exchange_error(maps, K, HZ),
+        exchange_error(maps, K, HZ, step=2 * STEP, margin=3),
         halo_error(high, HZ),
         nothing + 0.02,
     ]

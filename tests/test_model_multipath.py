@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch")
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model import multipath
 from tofcapture_model.geometry import rays
-from tofcapture_model.multipath import SIGNAL, bounce_error, cues, halo_error
+from tofcapture_model.multipath import SIGNAL, cues, exchange_error, halo_error, surface
 
 K = torch.tensor([[90.0, 90.0, 59.5, 44.5]])
 SHAPE = (90, 120)
@@ -38,11 +38,13 @@ def test_a_corner_looks_deeper_and_a_wall_does_not():
     errors = []
     for opening in (90, 130):
         depth, amplitude = corner(opening)
-        found = bounce_error(depth, torch.ones_like(depth), amplitude, K, HZ)
+        found = exchange_error(surface(depth, torch.ones_like(depth), amplitude, K), K, HZ)
         errors.append(found[..., 40:50, 45:75].mean().item())
     assert 0.002 < errors[1] < errors[0] < 0.1
     wall = torch.full((1, 1, *SHAPE), 0.8)
-    flat = bounce_error(wall, torch.ones_like(wall), torch.full_like(wall, 0.5 * SIGNAL / 0.64), K, HZ)
+    flat = exchange_error(
+        surface(wall, torch.ones_like(wall), torch.full_like(wall, 0.5 * SIGNAL / 0.64), K), K, HZ
+    )
     assert flat.abs().max() < 0.1 * errors[1]
 
 
@@ -60,9 +62,9 @@ def test_patches_are_as_large_and_as_white_as_the_wall_that_they_are_of(monkeypa
     distance = z * r.norm(dim=1, keepdim=True)
     amplitude = 0.5 * SIGNAL * (z / distance) / distance.square()
     wall = torch.full((1, 1, *SHAPE), z)
-    maps = multipath.surface(wall, torch.ones_like(wall), amplitude, K)
+    maps = surface(wall, torch.ones_like(wall), amplitude, K)
     torch.testing.assert_close(maps[:, 4], torch.full_like(maps[:, 4], 0.5), rtol=0.02, atol=0)
-    multipath.exchange_error(maps, K, HZ, step=10, margin=3)
+    exchange_error(maps, K, HZ, step=10, margin=3)
     torch.testing.assert_close(seen[0], torch.full_like(seen[0], (10 * z / 90) ** 2), rtol=1e-4, atol=0)
 
 
@@ -70,7 +72,7 @@ def test_dark_scenes_have_no_bounce():
     """Interreflection falls with the albedo of the other patches."""
     depth, amplitude = corner(90)
     bright, dark = (
-        bounce_error(depth, torch.ones_like(depth), a, K, HZ).mean().item()
+        exchange_error(surface(depth, torch.ones_like(depth), a, K), K, HZ).mean().item()
         for a in (amplitude, amplitude / 10)
     )
     assert dark < 0.15 * bright

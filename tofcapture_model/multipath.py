@@ -92,45 +92,6 @@ def halo_error(phasor: Tensor, hz: float, shrink: int = 6) -> Tensor:
     return (across / phasor.square().sum(1, keepdim=True).clamp_min(_FAINT**2) / k).clamp(-1, 1)
 
 
-def bounce_error(
-    depth: Tensor,
-    valid: Tensor,
-    amplitude: Tensor,
-    intrinsics: Tensor,
-    hz: float,
-    step: int = STEP,
-    margin: int = 0,
-) -> Tensor:
-    """Estimate the depth error of diffuse interreflection (after Fuchs 2010 and Jimenez 2014, whom the paper names).
-
-    The visible patches are a closed world of Lambertian surfaces: radiosity ``x = rho (E + K x)`` with the sensor's irradiance
-    ``E_p = cos_p / d_p^2 e^{i k d_p / 2}`` and ``K_pq = cos_pq cos_qp / (pi r^2) dS_q e^{i k r / 2}``; albedos come from the
-    measured amplitudes and one constant of the sensor. The error is the angle of ``1 + (K x)_p / E_p``: the albedo of the
-    patch itself cancels.
-
-    Occlusion between patches and what lies out of sight are not in it.
-
-    Parameters
-    ----------
-    depth, valid, amplitude
-        (B, 1, H, W) decoded depth in metres, its weight, amplitude in units of saturation.
-    intrinsics
-        (B, 4).
-    hz
-        Modulation frequency.
-    step
-        Pixels per patch; time goes with its inverse fourth power.
-    margin
-        Patches that are added beyond each border on the planes of the border, since the table does not end where the image
-        does; right where the scene goes on, too much where it does not.
-
-    Returns
-    -------
-    (B, 1, H, W) metres, positive where things look too far away
-    """
-    return exchange_error(surface(depth, valid, amplitude, intrinsics), intrinsics, hz, step, margin)
-
-
 def surface(depth: Tensor, valid: Tensor, amplitude: Tensor, intrinsics: Tensor) -> Tensor:
     """Tangent plane and albedo of every pixel (B, 5, H, W): unit normal, ``n . p`` in metres, albedo by the measured amplitude."""
     planes, _ = side_window_planes(depth, valid + 1e-3, 2)
@@ -148,7 +109,33 @@ def surface(depth: Tensor, valid: Tensor, amplitude: Tensor, intrinsics: Tensor)
 def exchange_error(
     surfaces: Tensor, intrinsics: Tensor, hz: float, step: int = STEP, margin: int = 0
 ) -> Tensor:
-    """Depth error of the light that the patches of :func:`surface` exchange; the rest as in :func:`bounce_error`."""
+    """Estimate the depth error of diffuse interreflection (after Fuchs 2010 and Jimenez 2014, whom the paper names).
+
+    The visible patches are a closed world of Lambertian surfaces: radiosity ``x = rho (E + K x)`` with the sensor's irradiance
+    ``E_p = cos_p / d_p^2 e^{i k d_p / 2}`` and ``K_pq = cos_pq cos_qp / (pi r^2) dS_q e^{i k r / 2}``; albedos come from the
+    measured amplitudes and one constant of the sensor. The error is the angle of ``1 + (K x)_p / E_p``: the albedo of the
+    patch itself cancels.
+
+    Occlusion between patches and what lies out of sight are not in it.
+
+    Parameters
+    ----------
+    surfaces
+        (B, 5, H, W), see :func:`surface`.
+    intrinsics
+        (B, 4).
+    hz
+        Modulation frequency.
+    step
+        Pixels per patch; time goes with its inverse fourth power.
+    margin
+        Patches that are added beyond each border on the planes of the border, since the table does not end where the image
+        does; right where the scene goes on, too much where it does not.
+
+    Returns
+    -------
+    (B, 1, H, W) metres, positive where things look too far away
+    """
     size = surfaces.shape[-2:]
     maps = surfaces[:, :, step // 2 :: step, step // 2 :: step]
     h, w = maps.shape[-2:]
