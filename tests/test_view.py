@@ -73,6 +73,15 @@ def prediction(tmp_path):
     return folder
 
 
+def test_a_prediction_without_expected_error_has_one_panel_less(prediction):
+    """The published networks predict none and write none."""
+    kinds = [panel.kind for panel in open_source(prediction).load(0).panels]
+    (prediction / "error.npy").unlink()
+    assert [panel.kind for panel in open_source(prediction).load(0).panels] == [
+        kind for kind in kinds if kind != "expected"
+    ]
+
+
 def test_kinds_are_told_apart(dataset, calibration, prediction):
     """Datasets, shards, predictions and calibrations are recognised by what they hold."""
     assert len(open_source(dataset).names) == 2 * len(open_source(dataset / "shards" / "mug.h5").names)

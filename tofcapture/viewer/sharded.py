@@ -73,9 +73,9 @@ def prediction_source(folder: Path) -> Source:
         A file of it is missing or damaged.
     """
     try:
-        depth, error, normals = (
-            np.load(folder / f"{n}.npy", allow_pickle=False) for n in ("depth", "error", "normals")
-        )
+        depth, normals = (np.load(folder / f"{n}.npy", allow_pickle=False) for n in ("depth", "normals"))
+        error = folder / "error.npy"  # some networks predict none
+        expected = [np.load(error, allow_pickle=False)] if error.exists() else []
         points = _ply_points(folder / "cloud.ply")
     except (OSError, ValueError) as err:
         raise DataError(
@@ -83,7 +83,7 @@ def prediction_source(folder: Path) -> Source:
         ) from err
     panels = [
         Panel("estimated depth", "depth", depth),
-        Panel("expected error", "expected", error),
+        *(Panel("expected error", "expected", image) for image in expected),
         Panel("estimated normals", "normals", normals),
     ]
     shot = Shot(folder.name, panels, {"estimate": Cloud(near(points), ESTIMATE)})
