@@ -10,7 +10,7 @@ pytest.importorskip("torch")
 
 from tests.analytic import make_dataset
 from tofcapture.files.manifest import load_manifest
-from tofcapture_model.checkpoint import load_model
+from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.learned import learned_from, not_new, sentence
 
 TOLD = (["mug", "lid"], ["s001-bowl"], ["lid"])
@@ -87,4 +87,5 @@ def test_the_bundled_network_tells_what_it_learned_from():
         "c3d_spot",
     }
     assert not measured & set(learned["objects"])
-    assert len(learned["shards"]) == 576
+    card = (find_model(None).parent / "MODEL_CARD.md").read_text(encoding="utf-8")
+    assert f"all {len(learned['shards'])} training shards and {len(learned['objects'])} shapes" in card
