@@ -140,10 +140,19 @@ def shoot(shapes, camera, index, seed, frames):
 
 
 def make_dataset(
-    folder, *, views=3, frames=2, scale=1, splits=("train", "train", "test"), seed=0, objects=()
+    folder,
+    *,
+    views=3,
+    frames=2,
+    scale=1,
+    splits=("train", "train", "test"),
+    seed=0,
+    objects=(),
+    distortion=(),
 ):
     """Write a dataset of analytic scenes; ``scale`` divides the sensor's resolution, ``objects`` are the scenes' as shards tell them."""
-    camera = Camera(240 // scale, 180 // scale, 190.6 / scale, 200.8 / scale, 116.8 / scale, 101.5 / scale)
+    f, c = (190.6 / scale, 200.8 / scale), (116.8 / scale, 101.5 / scale)
+    camera = Camera(240 // scale, 180 // scale, *f, *c, distortion)
     info = TofInfo("analytic", "0", camera, np.zeros(3))
     stereo = StereoInfo("none", "0", Camera(10, 8, 10, 10, 4.5, 3.5))
     rig = Rig(camera, stereo.camera, np.eye(4), np.eye(4))

@@ -21,7 +21,8 @@ from tofcapture_model.baselines.protocol import Baseline
 from tofcapture_model.baselines.sensor import upsample_depth
 from tofcapture_model.config import BASELINES, Config, Losses, Stage, loads_config, preset
 from tofcapture_model.frame import Target
-from tofcapture_model.geometry import metres_per_radian, rays, turn
+from tofcapture_model.geometry import metres_per_radian, turn
+from tofcapture_model.intrinsics import rays
 from tofcapture_model.zoo import build_model, select_stage, training_loss
 
 

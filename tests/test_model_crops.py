@@ -12,7 +12,8 @@ from tests.test_model_baselines import target
 from tests.test_model_networks import frame
 from tofcapture_model.data import FrameDataset, crop, mirror
 from tofcapture_model.frame import Frame, Target
-from tofcapture_model.geometry import scale_intrinsics, unproject
+from tofcapture_model.geometry import unproject
+from tofcapture_model.intrinsics import scale_intrinsics
 
 H, W = 36, 44
 

@@ -29,7 +29,8 @@ from tofcapture_model.data import (
     mirror,
     spare_memory,
 )
-from tofcapture_model.geometry import depth_to_normals, scale_intrinsics
+from tofcapture_model.geometry import depth_to_normals
+from tofcapture_model.intrinsics import scale_intrinsics
 from tofcapture_model.raw_input import NOMINAL_CAMERA
 
 

@@ -16,13 +16,12 @@ from tofcapture_model.geometry import (
     depth_to_normals,
     local_planes,
     propagate_depth,
-    rays,
-    scale_intrinsics,
     shifted,
     side_window_planes,
     unit,
     unproject,
 )
+from tofcapture_model.intrinsics import rays, scale_intrinsics
 from tofcapture_model.metrics import angles_deg
 from tofcapture_model.refine import Refinement
 

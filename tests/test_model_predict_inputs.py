@@ -18,8 +18,9 @@ from tests.test_model_predict import saved, table_top
 from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError
-from tofcapture.frames import TofInfo
-from tofcapture.rig import Rig, dumps_rig
+from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
+from tofcapture.ops.phase import taps
+from tofcapture.rig import SPEED_OF_LIGHT, Rig, dumps_rig
 from tofcapture_model import checkpoint
 from tofcapture_model import predict as predicting
 from tofcapture_model.checkpoint import find_model, load_model, save_model
@@ -59,6 +60,13 @@ def _fast(monkeypatch):
     """Time is not what these tests look at."""
     monkeypatch.setattr(predicting, "WARM", 0)
     monkeypatch.setattr(predicting, "RUNS", 1)
+
+
+def wall(camera, depth=0.8):
+    """(8, H, W) noiseless taps of a wall that faces the camera, along the rays of its lens."""
+    ranges = depth * camera.ray_lengths
+    z = 400 * np.exp(4j * np.pi * np.array([20e6, 100e6])[:, None, None] * ranges / SPEED_OF_LIGHT)
+    return np.rint(taps(z, np.full(z.shape, 600.0), PAPER_MODULATION_HZ, PAPER_PHASE_RAD)).astype(np.uint16)
 
 
 def burst_of(camera, frames=4):
@@ -259,15 +267,16 @@ def test_out_that_is_a_file_is_refused_before_anything_is_computed(weights, rig,
     assert file.read_text() == "mine"
 
 
-def test_a_lens_with_distortion_is_refused_with_what_to_do(weights, tmp_path):
-    """No network takes one; the message leads to the page that says what to do."""
+def test_a_lens_is_brought_by_the_rig(weights, tmp_path):
+    """The rays of the rig's lens are those of the answer: a wall is flat through it."""
     lens = replace(SMALL, distortion=(-0.1, 0.02, 0.0, 0.0, 0.0))
     path = tmp_path / "rig.toml"
     path.write_text(dumps_rig(Rig(lens, Camera(10, 8, 10, 10, 4.5, 3.5), np.eye(4), np.eye(4))))
-    raw = saved(tmp_path / "raw.npy", burst_of(SMALL, 1)[0])
-    with pytest.raises(ConfigError, match="without lens distortion, as all networks do") as caught:
-        predict(raw, tmp_path / "out", weights=weights, rig=path)
-    assert "own-camera.md" in caught.value.hint
+    raw = saved(tmp_path / "raw.npy", wall(lens))
+    predict(raw, tmp_path / "out", weights=weights, rig=path)
+    depth, normals = (np.load(tmp_path / "out" / f"{name}.npy") for name in ("depth", "normals"))
+    np.testing.assert_allclose(depth, 0.8, atol=2e-4)
+    assert np.degrees(np.arccos(-normals[..., 2].clip(-1, 1))).max() < 0.1
 
 
 def test_a_predictor_loads_once_and_times_nothing(weights, monkeypatch):
@@ -324,23 +333,6 @@ def test_the_lines_of_the_page_answer_frame_after_frame(weights, tmp_path, monke
     saved(tmp_path / "frames.npy", burst_of(NOMINAL_CAMERA, 2))
     exec(compile(code, "own-camera.md", "exec"), {})  # noqa: S102
     assert capsys.readouterr().out.count("measured 100%") == 2
-
-
-def test_the_page_rectifies_channels(tmp_path):
-    """The lines of the same page give a frame without distortion, in which saturated and missing pixels stay unmeasured."""
-    cv2 = pytest.importorskip("cv2")
-    page = (ROOT / "docs/howto/own-camera.md").read_text()
-    code = next(c for c in re.findall(r" *```python\n(.*?)```", page, re.DOTALL) if "undistort" in c)
-    raw = burst_of(SMALL, 1)[0]
-    raw[:, 17, 23] = 4095
-    lens = replace(SMALL, distortion=(-0.1, 0.02, 0.0, 0.0, 0.0))
-    names = {"raw": raw, "camera": lens, "saturation": 4095}
-    lines = "\n".join(line.removeprefix("   ") for line in code.splitlines())
-    exec(compile(lines, "own-camera.md", "exec"), names)  # noqa: S102
-    flat = names["flat"]
-    assert flat.shape == raw.shape
-    assert (flat[:, 17, 23] == 4095).all()
-    assert cv2.undistort(raw[0], np.eye(3), np.zeros(5)).dtype == raw.dtype
 
 
 def test_a_gpus_predictor_records_once_for_each_size(weights, monkeypatch):

@@ -26,7 +26,7 @@ from tofcapture.files.seal import sha256_of
 from tofcapture_model.checkpoint import load_model
 from tofcapture_model.config import Losses, Stage, preset, presets
 from tofcapture_model.data import make_target
-from tofcapture_model.geometry import rays, scale_intrinsics
+from tofcapture_model.intrinsics import rays, scale_intrinsics
 from tofcapture_model.losses import error_map_loss, laplace_loss, reweighting
 from tofcapture_model.measures import Precision, Uncertainty, regions
 from tofcapture_model.predict import predict

@@ -20,7 +20,8 @@ from torch import Tensor
 from tofcapture.errors import ConfigError
 from tofcapture.ops.phase import TapNoise
 from tofcapture_model.frame import Frame
-from tofcapture_model.geometry import metres_per_radian, rays, turn
+from tofcapture_model.geometry import metres_per_radian, turn
+from tofcapture_model.intrinsics import cut_intrinsics, mirror_intrinsics, rays
 
 FULL_SCALE = 4095.0  # raw units where a 12-bit sensor saturates
 _ORDERS = (0, 2, 4)  # of the phase: offset, and the wiggling of sensors with four phases
@@ -58,7 +59,7 @@ class RawItem(NamedTuple):
     mask
         (..., 2H, 2W) uint8, bits of :class:`tofcapture.files.layout.MaskBit`.
     intrinsics
-        (..., 4) fx, fy, cx, cy in pixels of the (H, W) grid.
+        (..., 4 or 9) of the (H, W) grid, see :mod:`tofcapture_model.intrinsics`.
     illuminator
         (..., 3) light source in the ToF frame, metres.
     """
@@ -74,13 +75,12 @@ class RawItem(NamedTuple):
 def flip(item: RawItem, axis: int = -1) -> RawItem:
     """Mirror left and right (axis -1) or up and down (axis -2): the world, and with it the camera and its lamp.
 
-    The principal point, that component of the normals and of the light source change with the images; the taps' phases do not.
+    The principal point and the lens, that component of the normals and of the light source change with the images; the taps' phases do not.
     """
     if axis not in (-1, -2):
         raise ConfigError(f"flip: expected the axis -1 or -2, got {axis}")
     component = -1 - axis  # x for columns, y for rows
-    intrinsics, light, normals = (x.clone() for x in (item.intrinsics, item.illuminator, item.normals))
-    intrinsics[..., 2 + component] = item.raw.shape[axis] - 1 - intrinsics[..., 2 + component]
+    light, normals = item.illuminator.clone(), item.normals.clone()
     light[..., component] *= -1
     normals[..., component] *= -1
     return RawItem(
@@ -88,7 +88,7 @@ def flip(item: RawItem, axis: int = -1) -> RawItem:
         item.depth.flip(axis),
         normals.flip(axis - 1),
         item.mask.flip(axis),
-        intrinsics,
+        mirror_intrinsics(item.intrinsics, axis, item.raw.shape[axis]),
         light,
     )
 
@@ -100,13 +100,12 @@ def crop(item: RawItem, top: int, left: int, size: tuple[int, int]) -> RawItem:
         raise ConfigError(f"crop: expected a window inside {(H, W)}, got {size} at {(top, left)}")
     rows, cols = slice(top, top + size[0]), slice(left, left + size[1])
     fine = (..., slice(2 * rows.start, 2 * rows.stop), slice(2 * cols.start, 2 * cols.stop))
-    shift = torch.tensor([0.0, 0.0, left, top]).to(item.intrinsics)
     return RawItem(
         item.raw[..., rows, cols],
         item.depth[fine],
         item.normals[(*fine, slice(None))],
         item.mask[fine],
-        item.intrinsics - shift,
+        cut_intrinsics(item.intrinsics, top, left),
         item.illuminator,
     )
 

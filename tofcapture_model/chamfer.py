@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from tofcapture_model import neighbours, tile_search, trees
+from tofcapture_model.intrinsics import PINHOLE
 from tofcapture_model.neighbours import Found
 
 JITTER = 0.010  # m, paper: 1 centimetre
@@ -64,7 +65,7 @@ def robust_chamfer(
     p_mask, q_mask
         (B, 1, H, W) bool: which pixels belong to the clouds.
     intrinsics
-        (B, 4) of the grid.
+        (B, 4) of the grid, or (B, 9): the lens says nothing of where the nearest points are, only how wide the slowest search looks.
     jitter
         Metres; 0 gives the plain Chamfer distance seven times.
     normals
@@ -85,7 +86,7 @@ def robust_chamfer(
             q[b],
             p_mask[b, 0],
             q_mask[b, 0],
-            intrinsics[b],
+            intrinsics[b, :PINHOLE],
             shifts,
             None if normals is None else normals[b],
             softness,

@@ -25,6 +25,7 @@ from tofcapture.ops.phase import Decoder, TapNoise, frequencies, photon_transfer
 from tofcapture.ops.phase.float32 import tap_weights
 from tofcapture_model.augment import BurstNoise
 from tofcapture_model.frame import NO_MAPS, Frame, Target
+from tofcapture_model.intrinsics import cut_intrinsics, intrinsics_of, mirror_intrinsics, with_lens
 from tofcapture_model.multipath import cues
 from tofcapture_model.raw_input import taken
 from tofcapture_model.shards import SampleId, all_samples, open_scenes
@@ -90,7 +91,7 @@ def decode_frame(raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: floa
         gap=_tensor(np.nan_to_num(signals.gap[None])),
         cues=torch.empty(0),
         modulation=torch.tensor(frequencies(info.modulation_hz), dtype=torch.float32),
-        intrinsics=torch.tensor([camera.pinhole("network input").fx, camera.fy, camera.cx, camera.cy]),
+        intrinsics=intrinsics_of(camera),
         demodulation=_tensor(tap_weights(info)[[0, 2, 1, 3]]),
     )
 
@@ -126,18 +127,16 @@ def crop(frame: Frame, target: Target, top: int, left: int, size: tuple[int, int
     rows, cols = slice(top, top + size[0]), slice(left, left + size[1])
     rows2, cols2 = slice(2 * top, 2 * (top + size[0])), slice(2 * left, 2 * (left + size[1]))
     maps = {k: v[..., rows, cols] for k, v in frame._asdict().items() if k not in NO_MAPS}
-    shift = torch.tensor([0.0, 0.0, float(left), float(top)])
-    cut = frame._replace(**maps, intrinsics=frame.intrinsics - shift)
+    cut = frame._replace(**maps, intrinsics=cut_intrinsics(frame.intrinsics, top, left))
     return cut, Target(*(x[..., rows2, cols2] for x in target))
 
 
 def mirror(frame: Frame, target: Target, axis: int = -1) -> tuple[Frame, Target]:
-    """Flip left and right (axis -1) or up and down (axis -2): images, principal point, and that component of the normals."""
+    """Flip left and right (axis -1) or up and down (axis -2): images, principal point and lens, and that component of the normals."""
     maps = {k: v.flip(axis) for k, v in frame._asdict().items() if k not in NO_MAPS}
-    intrinsics, sign = frame.intrinsics.clone(), torch.ones(3, 1, 1)
-    component = -1 - axis  # x for columns, y for rows
-    intrinsics[2 + component] = frame.depth.shape[axis] - 1 - intrinsics[2 + component]
-    sign[component] = -1
+    intrinsics = mirror_intrinsics(frame.intrinsics, axis, frame.depth.shape[axis])
+    sign = torch.ones(3, 1, 1)
+    sign[-1 - axis] = -1  # x for columns, y for rows
     flipped = Target(*(x.flip(axis) for x in target))
     return frame._replace(**maps, intrinsics=intrinsics), flipped._replace(normals=flipped.normals * sign)
 
@@ -203,6 +202,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
                 hint="record more scenes, or choose another --split",
             )
         _expect_alike(self.readers, self.size)
+        self.lens = any(reader.camera.distortion for reader in self.readers.values())
         self.burst = _burst_noise(self.readers, self.averaged) if mean else None
         self._room = cache_bytes - sum(
             TABLES * r.camera.width * r.camera.height for r in self.readers.values()
@@ -237,6 +237,8 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         if sample.scene not in self._decoders:
             self._decoders[sample.scene] = frame_decoder(reader.info, reader.camera)
         frame = make_frame(raw, reader.info, reader.camera, temperature, self._decoders[sample.scene])
+        if self.lens:  # a batch may hold frames of other cameras, without one
+            frame = frame._replace(intrinsics=with_lens(frame.intrinsics))
         if self._take_room(frame):
             self._frames[sample] = frame
         return frame

@@ -37,7 +37,7 @@ class Flat(nn.Module):
 
 
 def example(batch: int, size: tuple[int, int] = SIZE, seed: int = 0) -> Frame:
-    """Make a plausible frame of random numbers, for tracing and for checks."""
+    """Make a plausible frame of random numbers, for tracing and for checks; its camera has a lens, so what is traced takes any."""
     g = torch.Generator().manual_seed(seed)
     h, w = size
 
@@ -45,7 +45,7 @@ def example(batch: int, size: tuple[int, int] = SIZE, seed: int = 0) -> Frame:
         return torch.randn(batch, channels, h, w, generator=g)
 
     ramp = torch.linspace(0, 0.2, w).expand(batch, 1, h, w)
-    camera = torch.tensor([0.8 * w, 0.8 * w, (w - 1) / 2, (h - 1) / 2])
+    camera = torch.tensor([0.8 * w, 0.8 * w, (w - 1) / 2, (h - 1) / 2, -0.15, 0.03, 1e-3, -1e-3, 0.0])
     return Frame(
         raw=0.3 + 0.05 * noise(8),
         phasor=0.1 * noise(4),

@@ -32,7 +32,7 @@ class Frame(NamedTuple):
     modulation
         (B, 2) low and high modulation frequency, Hz.
     intrinsics
-        (B, 4) fx, fy, cx, cy in pixels of the (H, W) grid.
+        (B, 4) fx, fy, cx, cy in pixels of the (H, W) grid, or (B, 9) where there is a lens: :mod:`tofcapture_model.intrinsics`.
     demodulation
         (B, 4, K) weights that turn taps into ``phasor``.
     """

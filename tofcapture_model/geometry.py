@@ -1,6 +1,7 @@
 """Depth, rays and normals on the image grid, differentiable.
 
-Depth is z in metres, normals are unit and face the camera (``n . p < 0``), images are (B, C, H, W), pixel centres integers.
+Depth is z in metres, normals are unit and face the camera (``n . p < 0``), images are (B, C, H, W), pixel centres integers, intrinsics
+(B, 4) or, with a lens, (B, 9): :mod:`tofcapture_model.intrinsics`.
 All functions keep the dtype they are given; the project calls them in float32.
 """
 
@@ -16,27 +17,10 @@ from torch.nn import functional as F  # noqa: N812
 
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.frame import Frame
+from tofcapture_model.intrinsics import PINHOLE, pixel_slopes, rays
 
 _TINY = 1e-12
 _FAINT = 1e-10  # keeps atan2 differentiable where a pixel is dark
-
-
-def scale_intrinsics(intrinsics: Tensor, s: int) -> Tensor:
-    """Intrinsics (B, 4) of the same view at ``s`` times the resolution: ``f' = s f``, ``c' = s (c + 0.5) - 0.5``."""
-    f, c = intrinsics[:, :2], intrinsics[:, 2:]
-    return torch.cat([f * s, (c + 0.5) * s - 0.5], dim=1)
-
-
-def rays(intrinsics: Tensor, height: int, width: int) -> Tensor:
-    """(B, 3, H, W) rays through the pixel centres with z = 1, from intrinsics (B, 4) fx, fy, cx, cy."""
-    fx, fy, cx, cy = (intrinsics[:, i, None, None] for i in range(4))
-    v, u = torch.meshgrid(
-        torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device),
-        torch.arange(width, dtype=intrinsics.dtype, device=intrinsics.device),
-        indexing="ij",
-    )
-    x, y = (u - cx) / fx, (v - cy) / fy
-    return torch.stack([x, y, torch.ones_like(x)], dim=1)
 
 
 def unproject(depth: Tensor, intrinsics: Tensor) -> Tensor:
@@ -140,12 +124,19 @@ def local_planes(depth: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Ten
     return torch.stack([centre, a, b], dim=1), variance[:, None]
 
 
-def plane_normals(coefficients: Tensor, intrinsics: Tensor) -> Tensor:
-    """Turn :func:`local_planes` into unit camera-facing normals (B, 3, H, W)."""
+def plane_normals(coefficients: Tensor, intrinsics: Tensor, directions: Tensor | None = None) -> Tensor:
+    """Turn :func:`local_planes` into unit camera-facing normals (B, 3, H, W).
+
+    ``directions`` are the :func:`tofcapture_model.intrinsics.rays` of the grid, where they are at hand: a lens takes some time to invert.
+    """
     centre, a, b = coefficients.unbind(1)
-    fx, fy = intrinsics[:, 0, None, None], intrinsics[:, 1, None, None]
-    x, y, _ = rays(intrinsics, *centre.shape[-2:]).unbind(1)
-    outward = torch.stack([a * fx, b * fy, centre - a * fx * x - b * fy * y], dim=1)  # n . r = 1/z > 0
+    x, y, _ = (rays(intrinsics, *centre.shape[-2:]) if directions is None else directions).unbind(1)
+    ux, uy, vx, vy = pixel_slopes(intrinsics, x, y)
+    # a window is small beside the bend of a lens: inverse depth is linear in pixels about each one
+    along_x, along_y = (
+        (a * ux, b * vy) if intrinsics.shape[1] == PINHOLE else (a * ux + b * vx, a * uy + b * vy)
+    )
+    outward = torch.stack([along_x, along_y, centre - along_x * x - along_y * y], dim=1)  # n . r = 1/z > 0
     return -unit(outward)
 
 
@@ -157,7 +148,7 @@ def depth_to_normals(depth: Tensor, valid: Tensor, intrinsics: Tensor, radius: i
     depth, valid
         (B, 1, H, W) metres, and weight of every pixel.
     intrinsics
-        (B, 4).
+        (B, 4 or 9).
     radius
         4 is the 9 x 9 window of GeoNet.
 
@@ -229,7 +220,7 @@ def propagate_depth(
     depth, normals, confidence
         (B, 1, H, W) metres, (B, 3, H, W) unit, (B, 1, H, W) positive weight of each pixel as a voter.
     intrinsics
-        (B, 4).
+        (B, 4 or 9).
     radius, step
         Window in taps to each side, and pixels between taps.
     alpha

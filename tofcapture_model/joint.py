@@ -6,7 +6,7 @@ from torch import nn
 
 from tofcapture_model.config import Network
 from tofcapture_model.frame import Estimate, Frame
-from tofcapture_model.geometry import scale_intrinsics
+from tofcapture_model.intrinsics import scale_intrinsics
 from tofcapture_model.networks import CompactInputs, ErrorMap, PaperInputs, Raw2Depth, Raw2Normal, doubled
 from tofcapture_model.refine import Refinement
 from tofcapture_model.unet import UNet

@@ -9,7 +9,8 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.frame import Frame, Target
-from tofcapture_model.geometry import scale_intrinsics, unproject
+from tofcapture_model.geometry import unproject
+from tofcapture_model.intrinsics import scale_intrinsics
 
 EDGE_BAND = 5  # px at the output resolution, on either side of a step
 EDGE_STEP = 0.03  # m between a pixel and its neighbour's plane

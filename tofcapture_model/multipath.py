@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture.rig import SPEED_OF_LIGHT
-from tofcapture_model.geometry import plane_normals, rays, side_window_planes
+from tofcapture_model.geometry import plane_normals, side_window_planes
+from tofcapture_model.intrinsics import pixel_slopes, rays, thin_intrinsics
 
 SIGNAL = 0.04  # of saturation: amplitude of a white patch that faces the sensor at 1 m; networks correct it by a factor
 STEP = 10  # pixels per patch
@@ -34,7 +35,7 @@ def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: 
     depth, valid, gap
         (B, 1, H, W) decoded depth and its weight; range of the low minus range of the high frequency; metres.
     intrinsics
-        (B, 4).
+        (B, 4 or 9).
     hz
         High modulation frequency.
 
@@ -95,9 +96,9 @@ def halo_error(phasor: Tensor, hz: float, shrink: int = 6) -> Tensor:
 def surface(depth: Tensor, valid: Tensor, amplitude: Tensor, intrinsics: Tensor) -> Tensor:
     """Tangent plane and albedo of every pixel (B, 5, H, W): unit normal, ``n . p`` in metres, albedo by the measured amplitude."""
     planes, _ = side_window_planes(depth, valid + 1e-3, 2)
-    normals = plane_normals(planes, intrinsics)
-    smooth = (1 / planes[:, :1].clamp_min(0.1)) * valid + depth * (1 - valid)
     ray = rays(intrinsics, *depth.shape[-2:])
+    normals = plane_normals(planes, intrinsics, ray)
+    smooth = (1 / planes[:, :1].clamp_min(0.1)) * valid + depth * (1 - valid)
     slope = (normals * ray).sum(1, keepdim=True)  # negative
     square = ray.square().sum(1, keepdim=True)
     light = F.avg_pool2d(amplitude, 3, 1, 1, count_include_pad=False) * valid
@@ -123,7 +124,7 @@ def exchange_error(
     surfaces
         (B, 5, H, W), see :func:`surface`.
     intrinsics
-        (B, 4).
+        (B, 4 or 9).
     hz
         Modulation frequency.
     step
@@ -140,19 +141,22 @@ def exchange_error(
     maps = surfaces[:, :, step // 2 :: step, step // 2 :: step]
     h, w = maps.shape[-2:]
     around = F.pad(maps, (margin, margin, margin, margin), mode="replicate")
-    grid = torch.cat([intrinsics[:, :2] / step, (intrinsics[:, 2:] - step // 2) / step + margin], dim=1)
+    grid = thin_intrinsics(intrinsics, step, margin)
+    r = rays(grid, *around.shape[-2:])
+    ux, uy, vx, vy = pixel_slopes(grid, *r[:, :2].unbind(1))
+    density = (ux * vy - uy * vx).expand(r[:, 0].shape)  # patches per unit of the plane z = 1
     found = torch.stack(
         [
-            _exchange(m.flatten(1), r.flatten(1), g, hz)
-            for m, r, g in zip(around, rays(grid, *around.shape[-2:]), grid, strict=True)
+            _exchange(m.flatten(1), q.flatten(1), d.flatten(), hz)
+            for m, q, d in zip(around, r, density, strict=True)
         ]
     )
     inner = found.reshape(-1, 1, *around.shape[-2:])[..., margin : margin + h, margin : margin + w]
     return F.interpolate(inner, size=size, mode="bilinear", align_corners=False)
 
 
-def _exchange(maps: Tensor, r: Tensor, grid: Tensor, hz: float) -> Tensor:
-    """Depth error (N,) of patches (5, N): normal, plane distance, albedo; rays (3, N)."""
+def _exchange(maps: Tensor, r: Tensor, density: Tensor, hz: float) -> Tensor:
+    """Depth error (N,) of patches (5, N): normal, plane distance, albedo; rays (3, N); patches per unit of the plane z = 1 (N,)."""
     n = maps[:3].T
     slope = (maps[:3] * r).sum(0).clamp_max(-_GRAZING / 2)
     z = (maps[3] / slope).clamp(0.1, _FAR)
@@ -160,8 +164,8 @@ def _exchange(maps: Tensor, r: Tensor, grid: Tensor, hz: float) -> Tensor:
     k = 4 * math.pi * hz / SPEED_OF_LIGHT  # phase per metre of range, which is half a path
     distance = p.norm(dim=1)
     facing = (-(p * n).sum(1) / distance).clamp_min(_GRAZING)
-    # a pixel's solid angle is (z / d)^3 / (fx fy)
-    surface = z.pow(3) / distance / (grid[0] * grid[1]) / facing
+    # a pixel's solid angle is (z / d)^3 / (fx fy), where there is no lens
+    surface = z.pow(3) / distance / density / facing
     transfer = _transfer(p, n, surface, k)
     direct = torch.polar(facing / distance.square(), k * distance / 2)
     albedo, radiosity = maps[4], maps[4] * direct

@@ -15,14 +15,8 @@ from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.config import SOURCES, Network
 from tofcapture_model.frame import Frame, expect_channels
-from tofcapture_model.geometry import (
-    doubled_parts,
-    local_planes,
-    plane_normals,
-    rays,
-    side_window_planes,
-    unit,
-)
+from tofcapture_model.geometry import doubled_parts, local_planes, plane_normals, side_window_planes, unit
+from tofcapture_model.intrinsics import rays
 from tofcapture_model.unet import (
     CONVEX_CHANNELS,
     UNet,
@@ -95,7 +89,7 @@ class CompactInputs(nn.Module):
         r = rays(frame.intrinsics, *frame.depth.shape[-2:])
         planes = [side_window_planes(frame.depth, frame.valid + _HOLE, w) for w in self.windows]
         smooth = [1 / c[:, :1].clamp_min(1e-2) for c, _ in planes]
-        normals = [plane_normals(c, frame.intrinsics) for c, _ in planes]
+        normals = [plane_normals(c, frame.intrinsics, r) for c, _ in planes]
         channels = [
             *_phasor_channels(frame.phasor),
             (frame.depth - MIDDLE) / REACH,
@@ -226,7 +220,9 @@ class Raw2Normal(nn.Module):
     def _fitted(self, depth: Tensor, frame: Frame) -> list[Tensor]:
         coarse = F.avg_pool2d(depth, 2)
         weight = frame.valid + _HOLE
-        return [plane_normals(local_planes(coarse, weight, r)[0], frame.intrinsics) for r in self.fits]
+        k = frame.intrinsics
+        r = rays(k, *coarse.shape[-2:])
+        return [plane_normals(local_planes(coarse, weight, radius)[0], k, r) for radius in self.fits]
 
 
 def doubled(image: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.config import BASELINES
 from tofcapture_model.data import MAX_RANGE, batched, decode_frame, frame_decoder, make_frame, with_cues
 from tofcapture_model.frame import Frame, frame_to
+from tofcapture_model.intrinsics import LENS, with_lens
 from tofcapture_model.prediction import Prediction, write_prediction
 from tofcapture_model.raw_input import RawInput, expect_finite, read_input, taken
 
@@ -65,8 +66,8 @@ class Predictor:
     Raises
     ------
     ConfigError
-        No such weights or export, an export of other weights; when called: a camera with distortion, or of another size than the
-        export's.
+        No such weights or export, an export of other weights; when called: a camera of another size than the export's, or with a lens that
+        the export does not know.
     DataError
         When called: taps that are not finite, or of a frame in which no pixel measured anything.
     """
@@ -75,7 +76,7 @@ class Predictor:
         self._ask, self.network = _onnx_model(weights) if backend == "onnx" else _torch_model(weights, device)
         self._place = torch.device("cpu" if backend == "onnx" else device)
         self._known: tuple[TofInfo, Camera, Decoder] | None = None
-        self._recorded: dict[tuple[tuple[int, ...], float], Ask] = {}
+        self._recorded: dict[tuple[tuple[int, ...], int, float], Ask] = {}
         if self._on_gpu:
             torch.cuda.set_device(self._place)  # streams, graphs and waiting are the current one's
 
@@ -92,11 +93,6 @@ class Predictor:
     def _answer(
         self, raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float, where: str, watch: _Watch
     ) -> Prediction:
-        if camera.distortion:
-            raise ConfigError(
-                f"{where}: expected images without lens distortion, as all networks do, got k1 {camera.distortion[0]:.4g} and more",
-                hint="rectify each raw channel before it is recorded, or leave a small distortion out of the rig: docs/howto/own-camera.md",
-            )
         expect_finite(raw, where)
         parts = (raw, info, camera, celsius, self._decoder(info, camera))
         decode = decode_frame if self._on_gpu else make_frame  # a GPU has its cues computed there
@@ -127,7 +123,7 @@ class Predictor:
     def _launch(self, inputs: Frame, hz: float) -> Ask:
         if not self._on_gpu:
             return self._ask
-        key = (tuple(inputs.raw.shape), hz)
+        key = (tuple(inputs.raw.shape), inputs.intrinsics.shape[1], hz)
         if key not in self._recorded:
             self._recorded[key] = recorded(lambda frame: self._ask(with_cues(frame, hz)), inputs)
         return self._recorded[key]
@@ -275,6 +271,7 @@ def _onnx_model(weights: Path | None) -> tuple[Ask, str]:
     session = open_onnx(path)
     config = config_of(session, path, named if named != path else path.with_suffix(".safetensors"))
     size = tuple(session.get_inputs()[0].shape[-2:])
+    numbers = next((i.shape[1] for i in session.get_inputs() if i.name == "intrinsics"), LENS)
 
     def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         got = tuple(frame.depth.shape[-2:])
@@ -282,7 +279,13 @@ def _onnx_model(weights: Path | None) -> tuple[Ask, str]:
             raise ConfigError(
                 f"{path}: exported for frames of {size}, got {got}", hint="tofcapture export --size"
             )
-        depth, normals, error = (torch.from_numpy(x) for x in ask_onnx(session, frame))
+        if frame.intrinsics.shape[1] > numbers:
+            raise ConfigError(
+                f"{path}: exported for cameras without lens distortion, got one with",
+                hint="run tofcapture export again",
+            )
+        asked = frame._replace(intrinsics=with_lens(frame.intrinsics)[:, :numbers])
+        depth, normals, error = (torch.from_numpy(x) for x in ask_onnx(session, asked))
         return depth, normals, error
 
     return ask, config.network.kind

@@ -15,7 +15,7 @@ from tofcapture_model.baselines.protocol import Baseline
 from tofcapture_model.baselines.su2018 import ToFNet
 from tofcapture_model.config import Config, Losses
 from tofcapture_model.frame import Estimate, Frame, Target
-from tofcapture_model.geometry import scale_intrinsics
+from tofcapture_model.intrinsics import scale_intrinsics
 from tofcapture_model.joint import JointModel
 from tofcapture_model.losses import Objective, objective
 from tofcapture_model.unet import UNet

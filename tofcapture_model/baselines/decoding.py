@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from tofcapture_model.frame import Frame
-from tofcapture_model.geometry import metres_per_radian, rays, turn
+from tofcapture_model.geometry import metres_per_radian, turn
+from tofcapture_model.intrinsics import rays
 
 
 def decode(frame: Frame, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:

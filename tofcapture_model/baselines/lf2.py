@@ -16,12 +16,8 @@ from tofcapture_model.baselines.decoding import decode
 from tofcapture_model.baselines.protocol import NEAREST, NORMAL_RADIUS
 from tofcapture_model.baselines.sensor import upsample_depth
 from tofcapture_model.frame import Frame
-from tofcapture_model.geometry import (
-    depth_to_normals,
-    metres_per_radian,
-    scale_intrinsics,
-    shifted,
-)
+from tofcapture_model.geometry import depth_to_normals, metres_per_radian, shifted
+from tofcapture_model.intrinsics import scale_intrinsics
 
 GAUSSIAN = (0.1070, 0.1131, 0.1070, 0.1131, 0.1196, 0.1131, 0.1070, 0.1131, 0.1070)
 RANGE = 1.442695 * 5.0  # of the phase distance (1 - cos) / 2

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from tofcapture_model.baselines.sensor import upsample_depth
 from tofcapture_model.frame import Estimate, Frame, Target
-from tofcapture_model.geometry import depth_to_normals, scale_intrinsics
+from tofcapture_model.geometry import depth_to_normals
+from tofcapture_model.intrinsics import scale_intrinsics
 
 NORMAL_RADIUS = 4  # GeoNet's 9 x 9 window
 NEAREST = 0.05  # m

@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.frame import Frame
-from tofcapture_model.geometry import depth_to_normals, scale_intrinsics, shifted
+from tofcapture_model.geometry import depth_to_normals, shifted
+from tofcapture_model.intrinsics import scale_intrinsics
 
 _JUMP = 0.05  # m; across a larger step of depth a bilinear mean would be a point in the air
 

@@ -1,0 +1,283 @@
+"""Networks see through lenses: rays, normals, cues, crops, mirrors, loss, batches of unlike cameras, training, exports."""
+
+# ruff: noqa: E402  torch is optional
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+torch = pytest.importorskip("torch")
+
+from tests.analytic import make_dataset
+from tests.test_model_chamfer import oracle
+from tests.test_model_predict import saved
+from tests.test_model_predict_inputs import SMALL, save_network, wall
+from tofcapture.camera import Camera
+from tofcapture.errors import ConfigError
+from tofcapture.rig import Rig, dumps_rig
+from tofcapture_model import neighbours
+from tofcapture_model import predict as predicting
+from tofcapture_model.augment import RawItem
+from tofcapture_model.augment import crop as crop_item
+from tofcapture_model.augment import flip as flip_item
+from tofcapture_model.chamfer import candidate_shifts, robust_chamfer
+from tofcapture_model.config import Config, Network, Stage, preset
+from tofcapture_model.data import FrameDataset, collate, crop, mirror
+from tofcapture_model.evaluate import evaluate
+from tofcapture_model.geometry import depth_to_normals, propagate_depth, unproject
+from tofcapture_model.intrinsics import (
+    cut_intrinsics,
+    intrinsics_of,
+    mirror_intrinsics,
+    rays,
+    scale_intrinsics,
+    thin_intrinsics,
+    with_lens,
+)
+from tofcapture_model.multipath import cues
+from tofcapture_model.predict import predict
+from tofcapture_model.train import train
+
+PLAIN = Camera(120, 90, 95.0, 100.0, 58.4, 50.7)
+LENS = replace(PLAIN, distortion=(-0.2, 0.06, 0.002, -0.003, 0.01))
+
+
+def rays_of(camera):
+    """Rays (1, 3, H, W) by the camera's own, exact rule."""
+    return torch.tensor(camera.rays, dtype=torch.float32).permute(2, 0, 1)[None]
+
+
+def numbers(camera):
+    return intrinsics_of(camera)[None]
+
+
+def tilted(camera, normal=(0.3, -0.25, -1.0), distance=0.8):
+    """Depth (1, 1, H, W) and normal (1, 3, 1, 1) of a plane through (0, 0, distance), along the lens's rays."""
+    n = torch.tensor(normal) / np.linalg.norm(normal)
+    n = n.float()[None, :, None, None]
+    return (n[:, 2:] * distance) / (n * rays_of(camera)).sum(1, keepdim=True), n
+
+
+def degrees(found, expected):
+    apart = torch.linalg.cross(found, expected.expand_as(found), dim=1).norm(dim=1)
+    return torch.rad2deg(torch.atan2(apart, (found * expected).sum(1)))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.floats(35, 100),
+    st.tuples(
+        st.floats(-0.4, 0.4),
+        st.floats(-0.15, 0.15),
+        st.floats(-0.005, 0.005),
+        st.floats(-0.005, 0.005),
+        st.floats(-0.1, 0.1),
+    ),
+)
+def test_rays_are_the_cameras(focal, distortion):
+    """For every lens that a camera takes, at the sensor's resolution and at twice that."""
+    camera = Camera(60, 45, focal, 1.03 * focal, 28.4, 23.7, distortion)
+    try:
+        expected = rays_of(camera)
+    except ConfigError:
+        assume(False)
+    torch.testing.assert_close(rays(numbers(camera), *camera.shape), expected, atol=3e-5, rtol=0)
+    fine = scale_intrinsics(numbers(camera), 2)
+    torch.testing.assert_close(
+        rays(fine, *camera.scaled(2).shape), rays_of(camera.scaled(2)), atol=1e-4, rtol=0
+    )
+
+
+def test_windows_mirrors_and_every_tenth_pixel_keep_their_rays():
+    """What is cut, flipped or thinned looks where it looked; x and y of a mirrored world change sign."""
+    k, whole = numbers(LENS), rays_of(LENS)
+    close = {"atol": 1e-5, "rtol": 0}
+    torch.testing.assert_close(rays(cut_intrinsics(k, 11, 23), 40, 50), whole[..., 11:51, 23:73], **close)
+    torch.testing.assert_close(rays(thin_intrinsics(k, 10), 9, 12), whole[..., 5::10, 5::10], **close)
+    for axis, signs in ((-1, (-1, 1, 1)), (-2, (1, -1, 1))):
+        flipped = rays(mirror_intrinsics(k, axis, LENS.shape[axis]), *LENS.shape)
+        expected = whole.flip(axis) * torch.tensor(signs).reshape(1, 3, 1, 1)
+        torch.testing.assert_close(flipped, expected, **close)
+        twice = mirror_intrinsics(mirror_intrinsics(k, axis, 120), axis, 120)
+        torch.testing.assert_close(twice, k)
+
+
+def test_a_lens_of_zeros_is_none():
+    """Cameras with and without a lens may share a batch."""
+    k = numbers(PLAIN)
+    assert k.shape == (1, 4)
+    assert with_lens(k).shape == (1, 9)
+    torch.testing.assert_close(rays(with_lens(k), *PLAIN.shape), rays(k, *PLAIN.shape), atol=1e-6, rtol=0)
+    depth, _ = tilted(PLAIN)
+    found = [depth_to_normals(depth, torch.ones_like(depth), each) for each in (k, with_lens(k))]
+    torch.testing.assert_close(*found, atol=1e-5, rtol=0)
+
+
+def test_a_plane_is_flat_through_a_lens():
+    """Plane fits give its normal everywhere, points lie on it, and propagation leaves it where it is; a pinhole's numbers would not."""
+    depth, normal = tilted(LENS)
+    found = depth_to_normals(depth, torch.ones_like(depth), numbers(LENS), radius=3)
+    off = degrees(found, normal)[0]
+    assert off[3:-3, 3:-3].max() < 0.1
+    assert off.max() < 0.3  # the windows of the border look to one side, and the lens bends there most
+    wrong = depth_to_normals(depth, torch.ones_like(depth), numbers(PLAIN), radius=3)
+    assert degrees(wrong, normal).max() > 3
+    points = unproject(depth, numbers(LENS))
+    assert ((points * normal).sum(1) - normal[:, 2] * 0.8).abs().max() < 1e-5
+    moved = propagate_depth(depth, normal.expand_as(found), numbers(LENS), torch.ones_like(depth))
+    assert (moved - depth).abs().max() < 1e-5
+
+
+def test_expected_interreflection_does_not_depend_on_the_lens():
+    """The same corner through a lens and through a pinhole: along the same rays the physics expects the same error."""
+    maps = []
+    for camera in (PLAIN, LENS):
+        planes = [tilted(camera, (side * 0.9, 0.1, -0.7), 0.8)[0] for side in (1, -1)]
+        depth = torch.minimum(*(torch.where(p > 0, p, torch.inf) for p in planes)).clamp_max(1.6)
+        amplitude = 0.015 / (depth * rays_of(camera).norm(dim=1, keepdim=True)).square()
+        phase = 4 * np.pi * 1e8 / 299_792_458 * depth * rays_of(camera).norm(dim=1, keepdim=True)
+        phasor = torch.cat(
+            [torch.zeros(1, 2, *camera.shape), amplitude * phase.cos(), amplitude * phase.sin()], 1
+        )
+        seen = cues(phasor, depth, torch.ones_like(depth), torch.zeros_like(depth), numbers(camera), 1e8)
+        maps.append(seen[0, 0])
+    x, y, _ = rays_of(LENS)[0]
+    grid = torch.stack(
+        [(x * PLAIN.fx + PLAIN.cx + 0.5) / 60 - 1, (y * PLAIN.fy + PLAIN.cy + 0.5) / 45 - 1], -1
+    )
+    there = torch.nn.functional.grid_sample(maps[0][None, None], grid[None], align_corners=False)[0, 0]
+    inside = (grid.abs() < 0.75).all(-1)
+    inside &= torch.from_numpy(np.hypot(*np.mgrid[-45:45, -60:60]) < 50)
+    assert maps[0].max() > 0.01
+    assert ((maps[1] - there)[inside].abs().mean() / there[inside].mean()) < 0.08
+
+
+def test_the_search_in_a_grid_is_exact_through_a_lens():
+    """The slowest search looks along a pinhole's rays, and so much wider as the lens bends them."""
+    camera = Camera(48, 36, 60.0, 60.0, 23.5, 17.5, (-0.2, 0.05, 0.001, 0.001, 0.0))
+    rng = np.random.default_rng(3)
+    p, q = (
+        unproject(0.8 + 0.03 * torch.from_numpy(rng.random((1, 1, *camera.shape))).float(), numbers(camera))
+        for _ in range(2)
+    )
+    mask = torch.from_numpy(rng.random((1, 1, *camera.shape)) > 0.2)
+    truth = [oracle(p, q, mask, mask, s) for s in candidate_shifts().numpy()]
+    found = neighbours.nearest(p[0], q[0], mask[0, 0], mask[0, 0], numbers(camera)[0, :4], candidate_shifts())
+    for one, expected in zip(found, truth, strict=True):
+        mean = one.squared[0][mask[0, 0]].mean() + one.squared[1][mask[0, 0]].mean()
+        assert mean.item() == pytest.approx(expected, rel=1e-5)
+    assert robust_chamfer(p, q, mask, mask, numbers(camera)).loss.item() == pytest.approx(
+        min(truth), rel=1e-5
+    )
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory):
+    """A dataset through a strong lens, and one without, at half the sensor's resolution."""
+    folder = tmp_path_factory.mktemp("lens")
+    lens = make_dataset(folder / "lens", views=2, scale=2, distortion=LENS.distortion, seed=3)
+    plain = make_dataset(folder / "plain", views=2, scale=2, splits=("train",), seed=9)
+    return lens, plain
+
+
+def test_frames_crops_and_mirrors_keep_the_geometry(seen):
+    """Plane fits of the ground truth give its normals, in a whole frame, a window, a mirror, and as a raw item's."""
+    data = FrameDataset([seen[0]], "train")
+    frame, target = data[(0, 0)]
+    assert frame.intrinsics.shape == (9,)
+
+    def off(frame, target):
+        k = scale_intrinsics(frame.intrinsics[None], 2)
+        fitted = depth_to_normals(target.depth[None], target.good[None].float() + 1e-6, k, radius=1)
+        return degrees(fitted, target.normals[None])[target.good].median()
+
+    for changed in (
+        (frame, target),
+        crop(frame, target, 9, 31, (48, 64)),
+        mirror(frame, target, -1),
+        mirror(frame, target, -2),
+    ):
+        assert off(*changed) < 0.3
+    item = RawItem(
+        frame.raw,
+        target.depth[0],
+        target.normals.permute(1, 2, 0),
+        target.good[0].byte(),
+        frame.intrinsics,
+        torch.zeros(3),
+    )
+    for changed in (flip_item(item), crop_item(item, 9, 31, (48, 64))):
+        again = (
+            frame._replace(intrinsics=changed.intrinsics),
+            target._replace(
+                depth=changed.depth[None],
+                normals=changed.normals.permute(2, 0, 1),
+                good=changed.mask[None] > 0,
+            ),
+        )
+        assert off(*again) < 0.3
+
+
+def test_cameras_with_and_without_a_lens_share_a_batch(seen):
+    """The pinhole's frames get a lens that does nothing."""
+    data = FrameDataset(seen, "train")
+    frame, _ = collate([data[(0, i)] for i in range(len(data))])
+    assert frame.intrinsics.shape == (len(data), 9)
+    lenses = frame.intrinsics[:, 4:].abs().sum(1) > 0
+    assert lenses.any()
+    assert (~lenses).any()
+    assert FrameDataset([seen[1]], "train")[(0, 0)][0].intrinsics.shape == (4,)
+
+
+@pytest.mark.parametrize("kind", ["compact", "paper"])
+def test_networks_learn_and_are_measured_through_a_lens(seen, tmp_path, kind):
+    """Both networks train on both cameras; what is measured of the sensor through the lens is what is measured through a pinhole."""
+    base = preset("demo")
+    network = replace(base.network, width=4, levels=2) if kind == "compact" else Network(width=4, levels=2)
+    config = Config(
+        network=network,
+        losses=replace(base.losses, chamfer=0.1),
+        training=replace(base.training, batch=2, crop=(48, 64)),
+        stages=(Stage("joint", 1, 1e-3),),
+    )
+    lens, plain = seen
+    assert train(config, lens, tmp_path / "run", also=[plain]).steps > 0
+    straight = make_dataset(tmp_path / "straight", views=2, scale=2, seed=3)
+    found, without = (evaluate(d, tmp_path / "run", tmp_path / "results.json") for d in (lens, straight))
+    for of, name in (("depth", "mae"), ("normal", "mean_deg")):
+        told = [r["methods"]["sensor"][of]["pixel"][name] for r in (found, without)]
+        assert told[0] == pytest.approx(told[1], rel=0.1)
+    assert np.isfinite(found["methods"]["model"]["depth"]["pixel"]["mae"])
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_an_export_takes_any_lens(tmp_path, monkeypatch):
+    """One export serves cameras with and without a lens; one made before lenses were known says what to do."""
+    pytest.importorskip("onnxruntime")
+    onnx = pytest.importorskip("onnx")
+    from tofcapture_model.export import export
+
+    monkeypatch.setattr(predicting, "WARM", 0)
+    monkeypatch.setattr(predicting, "RUNS", 1)
+    base = preset("demo")
+    small = replace(base.network, width=4, levels=2, refine_iterations=0)
+    weights = save_network(tmp_path / "run", replace(base, network=small))
+    exported = weights.with_suffix(".onnx")
+    export(weights, exported, size=SMALL.shape)
+    for lens in ((), (-0.1, 0.02, 0.001, 0.002, 0.0)):
+        camera = replace(SMALL, distortion=lens)
+        rig = tmp_path / "rig.toml"
+        rig.write_text(dumps_rig(Rig(camera, Camera(10, 8, 10, 10, 4.5, 3.5), np.eye(4), np.eye(4))))
+        raw = saved(tmp_path / "raw.npy", wall(camera))
+        for backend in ("torch", "onnx"):
+            predict(raw, tmp_path / backend, weights=weights, rig=rig, backend=backend)
+        for name in ("depth", "normals"):
+            ours, theirs = (np.load(tmp_path / b / f"{name}.npy") for b in ("torch", "onnx"))
+            np.testing.assert_allclose(theirs, ours, atol=1e-4)
+    model = onnx.load(str(exported))
+    place = next(i for i in model.graph.input if i.name == "intrinsics")
+    assert place.type.tensor_type.shape.dim[1].dim_value == 9

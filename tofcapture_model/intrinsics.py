@@ -1,0 +1,108 @@
+"""A camera as numbers on a device, and the rays of its pixels.
+
+Intrinsics are (B, 4) fx, fy, cx, cy in pixels, pixel centres integers, or (B, 9) where there is a lens: OpenCV's k1, k2, p1, p2, k3
+behind them, as :class:`tofcapture.camera.Camera` has them. Networks see images as the sensor took them; nothing is rectified.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812
+
+from tofcapture.camera import Camera
+
+PINHOLE, LENS = 4, 9
+_NEWTON_STEPS = 8  # four do for most lenses; those that nearly fold at a corner take all to come within 1e-5
+
+
+def intrinsics_of(camera: Camera) -> Tensor:
+    """(4,) float32 of a pinhole, (9,) of a camera with a lens."""
+    return torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+
+
+def with_lens(intrinsics: Tensor) -> Tensor:
+    """Intrinsics (..., 9) of (..., 4): a lens that does nothing, so that cameras with and without one make a batch."""
+    return F.pad(intrinsics, (0, LENS - intrinsics.shape[-1]))
+
+
+def scale_intrinsics(intrinsics: Tensor, s: int) -> Tensor:
+    """Intrinsics (B, 4 or 9) of the same view at ``s`` times the resolution: ``f' = s f``, ``c' = s (c + 0.5) - 0.5``."""
+    f, c, lens = intrinsics[:, :2], intrinsics[:, 2:PINHOLE], intrinsics[:, PINHOLE:]
+    return torch.cat([f * s, (c + 0.5) * s - 0.5, lens], dim=1)
+
+
+def thin_intrinsics(intrinsics: Tensor, step: int, margin: int = 0) -> Tensor:
+    """Intrinsics (B, 4 or 9) of every ``step``-th pixel, from pixel ``step // 2`` on, with ``margin`` more of them at each border."""
+    f, c, lens = intrinsics[:, :2], intrinsics[:, 2:PINHOLE], intrinsics[:, PINHOLE:]
+    return torch.cat([f / step, (c - step // 2) / step + margin, lens], dim=1)
+
+
+def cut_intrinsics(intrinsics: Tensor, top: int, left: int) -> Tensor:
+    """Intrinsics (..., 4 or 9) of a window at (top, left): the principal point moves."""
+    moved = intrinsics.clone()
+    moved[..., 2] -= left
+    moved[..., 3] -= top
+    return moved
+
+
+def mirror_intrinsics(intrinsics: Tensor, axis: int, size: int) -> Tensor:
+    """Intrinsics (..., 4 or 9) of images of ``size`` pixels along ``axis``, flipped there: -1 left and right, -2 up and down.
+
+    The radial distortion stays as it is. Of the tangential one ``p2`` changes sign with x, ``p1`` with y.
+    """
+    flipped, component = intrinsics.clone(), -1 - axis
+    flipped[..., 2 + component] = size - 1 - flipped[..., 2 + component]
+    if intrinsics.shape[-1] == LENS:
+        flipped[..., 7 - component] *= -1
+    return flipped
+
+
+def rays(intrinsics: Tensor, height: int, width: int) -> Tensor:
+    """(B, 3, H, W) rays through the pixel centres with z = 1, from intrinsics (B, 4 or 9).
+
+    A lens is inverted by Newton's method in the given dtype; that it can be inverted, :class:`tofcapture.camera.Camera` has made sure of.
+    """
+    fx, fy, cx, cy = (intrinsics[:, i, None, None] for i in range(PINHOLE))
+    v, u = torch.meshgrid(
+        torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device),
+        torch.arange(width, dtype=intrinsics.dtype, device=intrinsics.device),
+        indexing="ij",
+    )
+    x, y = (u - cx) / fx, (v - cy) / fy
+    if intrinsics.shape[1] == LENS:
+        x, y = _undistorted(intrinsics, x, y)
+    return torch.stack([x, y, torch.ones_like(x)], dim=1)
+
+
+def pixel_slopes(intrinsics: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Derivatives du/dx, du/dy, dv/dx, dv/dy, in pixels, of the image at rays (x, y, 1): each (B, H, W), or (B, 1, 1) of a pinhole."""
+    fx, fy = intrinsics[:, 0, None, None], intrinsics[:, 1, None, None]
+    if intrinsics.shape[1] == PINHOLE:
+        return fx, torch.zeros_like(fx), torch.zeros_like(fy), fy
+    _, _, xx, both, yy = _distorted(intrinsics, x, y)
+    return fx * xx, fx * both, fy * both, fy * yy
+
+
+def _distorted(intrinsics: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Distorted x and y, and the derivative, which is symmetric: of x along x, of either along the other, of y along y."""
+    k1, k2, p1, p2, k3 = (intrinsics[:, i, None, None] for i in range(PINHOLE, LENS))
+    r2 = x * x + y * y
+    radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        radial + x * x * slope + 2 * p1 * y + 6 * p2 * x,
+        x * y * slope + 2 * p1 * x + 2 * p2 * y,
+        radial + y * y * slope + 6 * p1 * y + 2 * p2 * x,
+    )
+
+
+def _undistorted(intrinsics: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Invert :func:`_distorted`."""
+    goal_x, goal_y = x, y
+    for _ in range(_NEWTON_STEPS):
+        found_x, found_y, xx, both, yy = _distorted(intrinsics, x, y)
+        off_x, off_y, det = found_x - goal_x, found_y - goal_y, xx * yy - both * both
+        x, y = x - (yy * off_x - both * off_y) / det, y - (xx * off_y - both * off_x) / det
+    return x, y
