@@ -110,7 +110,7 @@ def main() -> None:
             burst = RawInput(raw[None], np.full(1, np.nan), info, NOMINAL_CAMERA)
             found = predict_raw(burst, 0, weights, args.device, timed=True)
             print(
-                f"{args.device}: decode and copy {found.decode_ms:.2f} ms, cues and network {found.inference_ms:.2f} ms"
+                f"{args.device}: copy of the taps {found.decode_ms:.2f} ms, decoding, cues and network {found.inference_ms:.2f} ms"
             )
             with torch.inference_mode():
                 print(throughput(model, frame, args.batch, args.device, args.repeats))

@@ -19,7 +19,7 @@ from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.cli.weights import bundled_path
 from tofcapture.errors import ConfigError, DataError
-from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD
+from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
 from tofcapture.ops.phase import taps
 from tofcapture.rig import SPEED_OF_LIGHT, Rig, dumps_rig
 from tofcapture_model import checkpoint
@@ -27,9 +27,10 @@ from tofcapture_model import predict as predicting
 from tofcapture_model.checkpoint import find_model, load_model, save_model
 from tofcapture_model.config import preset
 from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
-from tofcapture_model.frame import Frame, frame_to
+from tofcapture_model.frame import frame_to
 from tofcapture_model.predict import predict, predict_raw, recorded
 from tofcapture_model.raw_input import NOMINAL_CAMERA, NOMINAL_RANGE_ERRORS, read_input
+from tofcapture_model.torch_decoder import TorchDecoder
 from tofcapture_model.zoo import build_model
 
 ORDER = ("right", "blocks swapped", "interleaved", "reversed", "low reversed", "pairs")
@@ -263,18 +264,17 @@ class Hosts(TorchDispatchMode):
 
 
 def test_a_prediction_neither_copies_from_the_host_nor_looks_at_a_value(monkeypatch):
-    """What a CUDA graph may hold: seen on the meta device, where a GPU's tensors would be; ``recorded`` relies on it."""
-    shapes = {
-        "raw": (8, 48, 64), "phasor": (4, 48, 64), "depth": (1, 48, 64), "valid": (1, 48, 64), "confidence": (1, 48, 64),
-        "gap": (1, 48, 64), "cues": (0,), "modulation": (2,), "intrinsics": (4,), "demodulation": (4, 8),
-    }  # fmt: skip
-    model = build_model(preset("compact")).eval().to("meta")
+    """What a CUDA graph may hold, from taps to depth: seen on the meta device, where a GPU's tensors would be; ``recorded`` relies on it."""
+    there = torch.device("meta")
+    model = build_model(preset("compact")).eval().to(there)
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # knows no meta device
+    info = TofInfo("t", "", NOMINAL_CAMERA, np.array([0.007, 0, 0]), range_errors=NOMINAL_RANGE_ERRORS)
     with torch.inference_mode():
-        frame = Frame(**{name: torch.empty(2, *shape, device="meta") for name, shape in shapes.items()})
+        decoder = TorchDecoder(info, NOMINAL_CAMERA, there)
+        taps = decoder.taps(np.zeros((8, 180, 240), np.uint16), 40.0)
         with Hosts() as hosts:
-            found = model(with_cues(frame, 100e6))
-    assert found.depth.shape == (2, 1, 96, 128)
+            found = model(with_cues(decoder(taps), 100e6))
+    assert found.depth.shape == (1, 1, 360, 480)
     assert hosts.operations > 500
     assert hosts.seen == []
 

@@ -26,7 +26,7 @@ from tofcapture_model import predict as predicting
 from tofcapture_model.checkpoint import find_model, load_model, save_model
 from tofcapture_model.config import Config, Network, Stage, preset
 from tofcapture_model.predict import Predictor, predict, predict_raw
-from tofcapture_model.raw_input import NOMINAL_CAMERA, RawInput, read_input, taken
+from tofcapture_model.raw_input import NOMINAL_CAMERA, NOMINAL_RANGE_ERRORS, RawInput, read_input, taken
 from tofcapture_model.zoo import build_model
 
 ROOT = Path(__file__).parents[1]
@@ -275,7 +275,7 @@ def test_a_lens_is_brought_by_the_rig(weights, tmp_path):
     raw = saved(tmp_path / "raw.npy", wall(lens))
     predict(raw, tmp_path / "out", weights=weights, rig=path)
     depth, normals = (np.load(tmp_path / "out" / f"{name}.npy") for name in ("depth", "normals"))
-    np.testing.assert_allclose(depth, 0.8, atol=2e-4)
+    np.testing.assert_allclose(depth, 0.8, atol=5e-4)  # whole counts
     assert np.degrees(np.arccos(-normals[..., 2].clip(-1, 1))).max() < 0.1
 
 
@@ -335,18 +335,26 @@ def test_the_lines_of_the_page_answer_frame_after_frame(weights, tmp_path, monke
     assert capsys.readouterr().out.count("measured 100%") == 2
 
 
-def test_a_gpus_predictor_records_once_for_each_size(weights, monkeypatch):
-    """What it does there, on the processor: the cues are part of what is recorded, and the answers are the same."""
-    sizes = []
-    info, second = TofInfo("t", "", SMALL, np.zeros(3)), replace(SMALL, width=40, cx=19.5)
+def test_a_gpus_predictor_records_once_for_each_camera(weights, monkeypatch):
+    """What it does there, on the processor: decoding and cues are part of what is recorded, and the answers are the same."""
+    shapes = []
+    info = TofInfo("t", "", SMALL, np.array([0.007, 0.0, 0.0]), range_errors=NOMINAL_RANGE_ERRORS)
+    second = replace(info, camera=replace(SMALL, width=40, cx=19.5))
     burst = burst_of(SMALL, 2)
-    here = [Predictor(weights)(raw, info) for raw in burst]
-    monkeypatch.setattr(predicting, "recorded", lambda ask, like: sizes.append(like.raw.shape) or ask)
+    burst[1, :, 10:20, 10:20] = 4095
+    here = [Predictor(weights)(raw, info, celsius=30.0) for raw in burst]
+    monkeypatch.setattr(predicting, "recorded", lambda ask, like: shapes.append(tuple(like.raw.shape)) or ask)
     monkeypatch.setattr(Predictor, "_on_gpu", True)
     monkeypatch.setattr(torch.cuda, "set_device", lambda _: None)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
     there = Predictor(weights)
     for raw, expected in zip(burst, here, strict=True):
-        np.testing.assert_allclose(there(raw, info).depth, expected.depth, atol=1e-6)
-    there(burst[0, :, :, :40], replace(info, camera=second))
-    there(burst[1], info)
-    assert [tuple(s) for s in sizes] == [(1, 8, 36, 48), (1, 8, 36, 40)]
+        found = there(raw, info, celsius=30.0)
+        np.testing.assert_array_equal(found.measured, expected.measured)
+        np.testing.assert_allclose(
+            found.depth[expected.measured], expected.depth[expected.measured], atol=2e-4
+        )
+    there(burst[0, :, :, :40], second)
+    assert shapes == [(8, 36, 48), (8, 36, 40)]
+    with pytest.raises(DataError, match="expected pixels that measure"):
+        there(np.zeros_like(burst[0, :, :, :40]), second)

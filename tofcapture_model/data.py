@@ -24,7 +24,7 @@ from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoder, TapNoise, frequencies, photon_transfer
 from tofcapture.ops.phase.float32 import tap_weights
 from tofcapture_model.augment import BurstNoise
-from tofcapture_model.frame import NO_MAPS, Frame, Target
+from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, NO_MAPS, Frame, Target
 from tofcapture_model.intrinsics import cut_intrinsics, intrinsics_of, mirror_intrinsics, with_lens
 from tofcapture_model.multipath import cues
 from tofcapture_model.raw_input import taken
@@ -34,7 +34,6 @@ Float32 = NDArray[np.float32]
 MODEST = 1.5e9  # bytes, where the system does not tell what it has
 TABLES = 110  # bytes per pixel of a decoder and its camera's rays, one for each scene
 _MEASURED = 16  # scenes whose first burst the noise is measured on
-MAX_RANGE = 5.0  # m; a decoded depth beyond it is an unwrapping failure on this rig and counts as a hole
 
 
 def fill_nearest(image: Float32, valid: NDArray[np.bool_]) -> Float32:
@@ -72,16 +71,16 @@ def make_frame(
     decoder
         :func:`frame_decoder` of the same camera; ``None`` builds its tables anew, which takes as long as some frames.
     """
-    decoded = decode_frame(raw, info, camera, celsius, decoder or frame_decoder(info, camera))
+    decoded = _decoded(raw, info, camera, celsius, decoder or frame_decoder(info, camera))
     whole = with_cues(batched(decoded), frequencies(info.modulation_hz)[1])
     return decoded._replace(cues=whole.cues[0])
 
 
-def decode_frame(raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float, decoder: Decoder) -> Frame:
-    """Do the first part of :func:`make_frame`, which is the processor's: everything but the cues, which are empty."""
+def _decoded(raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float, decoder: Decoder) -> Frame:
+    """Everything but the cues, which are empty."""
     maps, signals = decoder.signals(raw, celsius)
     depth = maps.depth
-    valid = np.isfinite(depth) & (depth > 0.05) & (depth < MAX_RANGE)
+    valid = np.isfinite(depth) & (depth > MIN_RANGE) & (depth < MAX_RANGE)
     return Frame(
         raw=_tensor(raw) / info.saturation,
         phasor=_tensor(signals.phasor.reshape(4, *depth.shape)) / info.saturation,
@@ -97,7 +96,7 @@ def decode_frame(raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: floa
 
 
 def with_cues(frame: Frame, hz: float) -> Frame:
-    """Do the second part, on the frame's device: a batch of decoded frames with their cues; ``hz`` is the high frequency."""
+    """Add to a batch of decoded frames their cues, on its device; ``hz`` is the high frequency."""
     return frame._replace(cues=cues(frame.phasor, frame.depth, frame.valid, frame.gap, frame.intrinsics, hz))
 
 

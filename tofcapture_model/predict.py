@@ -7,7 +7,7 @@ import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -17,14 +17,16 @@ from torch import Tensor
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.frames import TofInfo
-from tofcapture.ops.phase import Decoder, frequencies
+from tofcapture.ops.phase import frequencies
 from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.config import BASELINES
-from tofcapture_model.data import MAX_RANGE, batched, decode_frame, frame_decoder, make_frame, with_cues
-from tofcapture_model.frame import Frame, frame_to
+from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
+from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
 from tofcapture_model.intrinsics import LENS, with_lens
+from tofcapture_model.joint import JointModel
 from tofcapture_model.prediction import Prediction, write_prediction
 from tofcapture_model.raw_input import RawInput, expect_finite, read_input, taken
+from tofcapture_model.torch_decoder import Taps, TorchDecoder
 
 Float32 = NDArray[np.float32]
 T = TypeVar("T")
@@ -40,8 +42,15 @@ class _Watch(Protocol):
     def __call__(self, work: Callable[[], T], wait: Callable[[], None], /) -> tuple[T, float]: ...
 
 
+class _Way(NamedTuple):
+    """How one camera's frames are answered: taps and temperature to inputs on the device, these to depth, normals, error and what was measured."""
+
+    prepare: Callable[[NDArray[Any], float], Any]
+    ask: Callable[[Any], tuple[Tensor, ...]]
+
+
 class Predictor:
-    """A network that answers frame after frame: loaded once, and on a GPU recorded once per image size.
+    """A network that answers frame after frame: loaded once, and on a GPU recorded once per camera.
 
     Call it with
 
@@ -75,8 +84,7 @@ class Predictor:
     def __init__(self, weights: Path | None = None, device: str = "cpu", backend: str = "torch") -> None:
         self._ask, self.network = _onnx_model(weights) if backend == "onnx" else _torch_model(weights, device)
         self._place = torch.device("cpu" if backend == "onnx" else device)
-        self._known: tuple[TofInfo, Camera, Decoder] | None = None
-        self._recorded: dict[tuple[tuple[int, ...], int, float], Ask] = {}
+        self._known: tuple[TofInfo, Camera, _Way] | None = None
         if self._on_gpu:
             torch.cuda.set_device(self._place)  # streams, graphs and waiting are the current one's
 
@@ -94,16 +102,14 @@ class Predictor:
         self, raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float, where: str, watch: _Watch
     ) -> Prediction:
         expect_finite(raw, where)
-        parts = (raw, info, camera, celsius, self._decoder(info, camera))
-        decode = decode_frame if self._on_gpu else make_frame  # a GPU has its cues computed there
         wait: Callable[[], None] = torch.cuda.synchronize if self._on_gpu else lambda: None
         with torch.inference_mode():
-            inputs, decode_ms = watch(lambda: frame_to(batched(decode(*parts)), self._place), wait)
-            measured = inputs.valid[0, 0].cpu().numpy() > 0
-            if not measured.any():
-                raise _nothing(raw, info, where)
-            launch = self._launch(inputs, frequencies(info.modulation_hz)[1])
-            (depth, normals, error), inference_ms = watch(lambda: launch(inputs), wait)
+            way = self._way(info, camera)
+            inputs, decode_ms = watch(lambda: way.prepare(raw, celsius), wait)
+            (depth, normals, error, valid), inference_ms = watch(lambda: way.ask(inputs), wait)
+        measured = _image(valid)[0] > 0
+        if not measured.any():
+            raise _nothing(raw, info, where)
         return Prediction(
             depth=_image(depth)[0],
             error=None if self.network in BASELINES else _image(error)[0],
@@ -115,18 +121,31 @@ class Predictor:
             decode_ms=decode_ms,
         )
 
-    def _decoder(self, info: TofInfo, camera: Camera) -> Decoder:
+    def _way(self, info: TofInfo, camera: Camera) -> _Way:
         if self._known is None or self._known[0] is not info or self._known[1] != camera:
-            self._known = info, camera, frame_decoder(info, camera)
+            make = self._on_the_device if self._on_gpu else self._on_the_host
+            self._known = info, camera, make(info, camera)
         return self._known[2]
 
-    def _launch(self, inputs: Frame, hz: float) -> Ask:
-        if not self._on_gpu:
-            return self._ask
-        key = (tuple(inputs.raw.shape), inputs.intrinsics.shape[1], hz)
-        if key not in self._recorded:
-            self._recorded[key] = recorded(lambda frame: self._ask(with_cues(frame, hz)), inputs)
-        return self._recorded[key]
+    def _on_the_host(self, info: TofInfo, camera: Camera) -> _Way:
+        """Decode by the tables of numpy; what is asked is a frame."""
+        decoder = frame_decoder(info, camera)
+
+        def ask(frame: Frame) -> tuple[Tensor, ...]:
+            return *self._ask(frame), frame.valid
+
+        return _Way(lambda raw, celsius: batched(make_frame(raw, info, camera, celsius, decoder)), ask)
+
+    def _on_the_device(self, info: TofInfo, camera: Camera) -> _Way:
+        """Copy the taps, and launch all the rest at once."""
+        decoder, high = TorchDecoder(info, camera, self._place), frequencies(info.modulation_hz)[1]
+
+        def ask(taps: Taps) -> tuple[Tensor, ...]:
+            frame = with_cues(decoder(taps), high)
+            return *self._ask(frame), frame.valid
+
+        dark = np.zeros((len(info.modulation_hz), *camera.shape), np.float32)
+        return _Way(decoder.taps, recorded(ask, decoder.taps(dark, math.nan)))
 
 
 def _image(tensor: Tensor) -> Float32:
@@ -139,7 +158,7 @@ def _nothing(raw: NDArray[Any], info: TofInfo, where: str) -> DataError:
     share = float((raw.max(axis=0) >= info.saturation).mean())
     what = f"{share:.0%} of them are saturated" if share else "no light, or none that was modulated"
     return DataError(
-        f"{where}: expected pixels that measure a depth between 0.05 and {MAX_RANGE:g} m, got none of {raw[0].size}: {what}",
+        f"{where}: expected pixels that measure a depth between {MIN_RANGE:g} and {MAX_RANGE:g} m, got none of {raw[0].size}: {what}",
         hint="choose another --frame, or record again with another exposure",
     )
 
@@ -195,9 +214,12 @@ def _timed(work: Callable[[], T], wait: Callable[[], None]) -> tuple[T, float]:
 
 
 Ask = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
+Inputs = TypeVar("Inputs", Frame, Taps)
 
 
-def recorded(ask: Ask, like: Frame) -> Ask:
+def recorded(
+    ask: Callable[[Inputs], tuple[Tensor, ...]], like: Inputs
+) -> Callable[[Inputs], tuple[Tensor, ...]]:
     """Record what a GPU does for a frame as a CUDA graph, so that every further one takes a single launch.
 
     A prediction is about a thousand small kernels; launching them one by one takes longer than running them.
@@ -205,15 +227,15 @@ def recorded(ask: Ask, like: Frame) -> Ask:
     Parameters
     ----------
     ask
-        Depth, normals and error of a batch, without a look at any value on the way and without copies from the host.
+        Tensors of a frame or of taps, without a look at any value on the way and without copies from the host.
     like
-        Of the shapes and on the device of all frames to come.
+        Of the shapes and on the device of all that will be asked.
 
     Returns
     -------
     The same question; an answer lasts until the next one.
     """
-    held = Frame(*(x.clone() for x in like))
+    held = type(like)(*(x.clone() for x in like))
     beside = torch.cuda.Stream(like.raw.device)  # type: ignore[no-untyped-call]
     beside.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(beside):  # libraries choose and allocate on first use, which cannot be recorded
@@ -224,8 +246,8 @@ def recorded(ask: Ask, like: Frame) -> Ask:
     with torch.cuda.graph(graph):
         answer = ask(held)
 
-    def replay(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        for place, new in zip(held, frame, strict=True):
+    def replay(inputs: Inputs) -> tuple[Tensor, ...]:
+        for place, new in zip(held, inputs, strict=True):
             place.copy_(new)
         graph.replay()
         return answer
@@ -239,6 +261,8 @@ def _torch_model(weights: Path | None, device: str) -> tuple[Ask, str]:
     model = model.to(device)
     kind = torch.device(device).type
     half = config.training.precision == "bfloat16" and has_bfloat16(kind)
+    if half and isinstance(model, JointModel):  # baselines have layers that stay in float32
+        _halve_convolutions(model)
 
     def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         # weights that are cast and kept would be lost to a graph that was recorded with them
@@ -247,6 +271,13 @@ def _torch_model(weights: Path | None, device: str) -> tuple[Ask, str]:
         return found.depth, found.normals, found.error
 
     return ask, config.network.kind
+
+
+def _halve_convolutions(model: JointModel) -> None:
+    """Round their weights once, to what autocast would round them to for every frame."""
+    for module in model.modules():
+        if isinstance(module, torch.nn.Conv2d | torch.nn.ConvTranspose2d):
+            module.to(torch.bfloat16)
 
 
 def has_bfloat16(kind: str) -> bool:

@@ -36,10 +36,10 @@ class Prediction:
     network
         Kind of network that answered.
     inference_ms
-        Median time of the network, after loading and decoding; on a GPU with that of the physical cues; NaN: not timed.
+        Median time of the network, after loading and decoding; on a GPU with that of decoding and of the physical cues; NaN: not timed.
     decode_ms
-        Median time of decoding the raw frame, after the camera's tables are built, and of the physical cues; on a GPU of decoding and
-        of the way there; NaN: not timed.
+        Median time of decoding the raw frame, after the camera's tables are built, and of the physical cues; on a GPU of the taps' way
+        there; NaN: not timed.
     """
 
     depth: Float32
