@@ -15,7 +15,7 @@ from calibration.board_model import Model, clear_of_walls, on_front
 from calibration.lens import LensRefused
 from calibration.registration import tukey_weights
 from tofcapture.camera import Camera
-from tofcapture.errors import DataError
+from tofcapture.errors import ConfigError, DataError
 from tofcapture.poses import Float64, exp
 
 MIN_VIEWS = 5
@@ -29,6 +29,7 @@ STEP = np.array([0.01, 0.01, 0.01, 0.01, 1e-5, 1e-5, 1e-6, 1e-6, 1e-5])  # of a 
 PRIOR = np.array([30.0, 30.0, 15.0, 15.0, 0.5, 0.5, 0.01, 0.01, 0.5])
 MODELS = {"pinhole": 4, "k1 k2 p1 p2": 8, "k1 k2 p1 p2 k3": 9}
 BETTER = 0.98  # a richer lens must lower the error at left-out views to this share
+HALVINGS = 6  # of a step whose lens folds
 NOISE = 0.3  # px, of a rim, against the priors
 
 
@@ -149,7 +150,7 @@ def _fit(model: Model, views: Sequence[BoardSeen], start: Camera, name: str, fre
     for step in range(len(SCALES) + MORE_STEPS):
         scale = SCALES[min(step, len(SCALES) - 1)]
         rows = [_rows(model, v, T, state, scale) for v, T in zip(views, state.poses, strict=True)]
-        delta = _solve(rows, _values(state.camera) - begin, free)
+        delta = _without_fold(state.camera, _solve(rows, _values(state.camera) - begin, free))
         state = _moved(state, delta, rows, free)
         if (
             step >= len(SCALES)
@@ -224,6 +225,25 @@ def _solve(rows: Sequence[_Rows], away: Float64, free: int) -> Float64:
     out = np.zeros(10)
     out[use] = np.linalg.solve(H[np.ix_(use, use)], g[use])
     return out
+
+
+def _without_fold(camera: Camera, delta: Float64) -> Float64:
+    """A step (10,) of the lens, halved until its image does not fold: far from the answer the first steps go too far.
+
+    Raises
+    ------
+    ConfigError
+        The smallest of them folds, too.
+    """
+    for tried in range(HALVINGS + 1):
+        try:
+            _camera(_values(camera) + delta[:9], camera).rays  # noqa: B018  which inverts the lens at every pixel
+            break
+        except ConfigError:
+            if tried == HALVINGS:
+                raise
+            delta = delta / 2
+    return delta
 
 
 def _pose_step(r: _Rows, delta: Float64) -> Float64:

@@ -45,8 +45,13 @@ def run(args: argparse.Namespace) -> Outcome:
     from tofcapture.rig import dumps_rig
 
     recording, board = Path(args.recording), load_board(args.board)
-    views, refused, rig = seen_boards(recording, board)
+    rig = believed_rig(recording)
+    views, refused = seen_boards(recording, board, rig)
     fit = fit_lens_to_board(Model(board), views, rig.tof)
+    if refused:  # with a wrong lens a board may look like another one: once more with the one that was found
+        again, still = seen_boards(recording, board, replace(rig, tof=fit.camera))
+        if len(again) > len(views):
+            refused, fit = still, fit_lens_to_board(Model(board), again, rig.tof)
     data = {**report(fit, rig), "refused": refused}
     if not args.dry_run:
         write_atomically(recording / "lens.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
@@ -55,25 +60,31 @@ def run(args: argparse.Namespace) -> Outcome:
     return Outcome(data=data, text=table(data))
 
 
-def seen_boards(recording: Path, board: Board) -> tuple[list[BoardSeen], list[str], Rig]:
-    """Rims of every view whose board is found, why it was not elsewhere, and the rig to start from."""
-    from calibration.cli import _progress
+def believed_rig(recording: Path) -> Rig:
+    """Rig to start from: what was aligned or calibrated before, else what the first view says."""
     from calibration.pairs import calibration_views
     from tofcapture.files.view import read_view
     from tofcapture.rig import load_rig
 
+    path = recording / "rig.toml"
+    return load_rig(path) if path.exists() else read_view(calibration_views(recording)[0]).rig
+
+
+def seen_boards(recording: Path, board: Board, rig: Rig) -> tuple[list[BoardSeen], list[str]]:
+    """Rims of every view whose board is found, and why it was not elsewhere."""
+    from calibration.cli import _progress
+    from calibration.pairs import calibration_views
+    from tofcapture.files.view import read_view
+
     paths, found, refused = calibration_views(recording), [], []
-    rig = load_rig(recording / "rig.toml") if (recording / "rig.toml").exists() else None
     with _progress() as progress:
         for i, path in enumerate(paths):
             progress("board", i, len(paths))
-            view = read_view(path)
-            rig = rig or view.rig
             try:
-                found.append(board_seen(view, rig, board, path.stem))
+                found.append(board_seen(read_view(path), rig, board, path.stem))
             except QualityError as err:
                 refused.append(f"{path.stem} {err}")
-    return found, refused, rig or view.rig
+    return found, refused
 
 
 def board_seen(view: View, rig: Rig, board: Board, name: str) -> BoardSeen:
@@ -128,7 +139,9 @@ def report(fit: BoardLens, rig: Rig) -> dict[str, Any]:
 
 def table(data: dict[str, Any]) -> str:
     """Lay a report out for a person."""
-    lines = [f"{data['views']} views, {len(data['refused'])} refused; lens: {data['model']}"]
+    held = data["model"] == "pinhole" and data["lens"]["k1"]["value"]
+    model = "distortion as before" if held else data["model"]
+    lines = [f"{data['views']} views, {len(data['refused'])} refused; lens: {model}"]
     lines += [
         f"  {name:4}{v['value']:12.5g} +- {v['sigma']:<10.2g} before {v['before']:.5g}"
         for name, v in data["lens"].items()

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calibration import lens_cli
 from calibration.board import load_board
 from calibration.board_model import Model, clear_of_walls
 from calibration.lens_board import BoardSeen, fit_lens_to_board
 from calibration.lens_cli import report, table
 from tofcapture import poses
 from tofcapture.camera import Camera
-from tofcapture.errors import DataError
+from tofcapture.cli import main
+from tofcapture.devices.station import DEFAULT
+from tofcapture.errors import DataError, QualityError
+from tofcapture.files.view import read_view
 from tofcapture.poses import invert, look_at
-from tofcapture.rig import Rig
+from tofcapture.rig import Rig, dumps_rig, load_rig
 
 MODEL = Model(load_board())
 TRUE = Camera(240, 180, 191.5, 200.2, 117.9, 100.6, (-0.12, 0.05, 0.0008, -0.0006, 0.0))
@@ -81,3 +87,47 @@ def test_too_few_views_are_refused():
     """Three views say so."""
     with pytest.raises(DataError, match="at least 5"):
         fit_lens_to_board(MODEL, seen(TRUE, 3), GUESS)
+
+
+def test_views_that_a_wrong_lens_hid_are_looked_at_again(tmp_path, monkeypatch, capsys):
+    """With the believed pinhole three boards look like another one; with the lens of the others they are found, and used."""
+    stereo = Camera(1280, 1024, 1155.0, 1155.0, 639.5, 511.5)
+    (tmp_path / "rig.toml").write_text(dumps_rig(Rig(GUESS, stereo, np.eye(4), np.eye(4))))
+    views = {v.name: v for v in seen(TRUE)}
+    hidden = ["view-003", "view-007", "view-012"]
+
+    def look(view, rig, board, name):
+        if name == "view-001" or (name in hidden and not rig.tof.distortion):
+            raise QualityError("board: wrong board")
+        return views[name]
+
+    monkeypatch.setattr("calibration.pairs.calibration_views", lambda _: [Path(name) for name in views])
+    monkeypatch.setattr("tofcapture.files.view.read_view", lambda path: path)
+    monkeypatch.setattr(lens_cli, "board_seen", look)
+    assert main(["calibrate", "lens", str(tmp_path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    told = told.get("data", told)
+    assert told["views"] == len(views) - 1
+    assert [r.split()[0] for r in told["refused"]] == ["view-001"]
+    assert farthest(load_rig(tmp_path / "rig.toml").tof, TRUE) < 0.6
+
+
+@pytest.mark.slow
+def test_a_recording_through_an_unknown_lens_gives_the_lens(tmp_path, capsys):
+    """From record to rig.toml by commands: a driver that describes a pinhole, one per cent off, and the lens that the station has."""
+    lens = (-0.18, 0.05, 0.001, -0.0008, 0.0)
+    station = tmp_path / "station.toml"
+    station.write_text(f"{DEFAULT.read_text()}\n[sim.tof]\ndistortion = {list(lens)}\n")
+    recording = tmp_path / "board"
+    assert main(["record", "--calibration", "--station", str(station), "--out", str(recording)]) == 0
+    rig = read_view(min((recording / "views/calibration").glob("*.h5"))).rig
+    true = rig.tof
+    assert true.distortion == lens
+    wrong = replace(true, fx=true.fx * 1.01, fy=true.fy * 0.99, cx=true.cx + 2, cy=true.cy - 2, distortion=())
+    (recording / "rig.toml").write_text(dumps_rig(replace(rig, tof=wrong)))
+    assert main(["calibrate", "lens", str(recording)]) == 0
+    assert "verdict: PASS" in capsys.readouterr().out
+    found = load_rig(recording / "rig.toml").tof
+    told = json.loads((recording / "lens.json").read_text())
+    assert told["views"] >= 10
+    assert farthest(found, true) < 3 * told["pixel_sigma"] < 1
