@@ -168,3 +168,44 @@ def test_without_numba_the_torch_search_gives_the_same_loss(monkeypatch):
     plain = chamfer.robust_chamfer(p, q, mask, mask, camera)
     assert plain.winner.item() == compiled.winner.item()
     assert plain.loss.item() == pytest.approx(compiled.loss.item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("count", [5, 256, 300, 2048, 4000])
+def test_sharing_out_leaves_loses_no_point(count):
+    """The same points with the same pixels, before as after; across steps the boxes of the leaves are far shorter along the rays."""
+    from tofcapture_model.kernels.boxes import FAN, tidy
+
+    rng = np.random.default_rng(count)
+    near = rng.random(count) < 0.5
+    points = np.stack([*rng.uniform(-0.02, 0.02, (2, count)), np.where(near, 0.5, 0.9)]).astype(np.float32)
+    leaves = np.full((-(-count // FAN), 3, FAN), np.inf, np.float32)
+    for i in range(count):
+        leaves[i // FAN, :, i % FAN] = points[:, i]
+    pixels = np.arange(count)
+    tidy(leaves, pixels)
+    assert sorted(pixels) == list(range(count))
+    after = leaves.transpose(0, 2, 1).reshape(-1, 3)
+    np.testing.assert_array_equal(after[:count], points.T[pixels])
+    assert np.isinf(after[count:]).all()
+    depth = np.where(np.isfinite(leaves[:, 2]), leaves[:, 2], leaves[:, 2, :1])
+    mixed = (np.ptp(depth, axis=1) > 0.1).mean()
+    assert mixed <= max(0.13, 1.01 / len(leaves)) or count < FAN
+
+
+def test_bounds_of_other_shifts_are_below_their_truth_and_rise_to_it():
+    """No square changes by more than the clouds are moved: from any answer to any other shift."""
+    from tofcapture_model.kernels.boxes import bound
+
+    rng = np.random.default_rng(4)
+    camera = torch.tensor([[40.0, 43.0, 30.0, 20.0]])
+    p, q = (unproject(depths("stepped", (24, 32), rng)[None, None], camera)[0] for _ in range(2))
+    mask = torch.ones(24, 32, dtype=torch.bool)
+    every = [f.squared[0].flatten().numpy() for f in trees.nearest(p, q, mask, mask, SHIFTS)]
+    for known, shift in zip(every, SHIFTS, strict=True):
+        for truth, other in zip(every, SHIFTS, strict=True):
+            sums = np.zeros(len(known) // 16)
+            bound(known, float((shift - other).norm()), sums)
+            exact = truth.reshape(-1, 16).astype(float).sum(1)
+            assert (sums <= exact * (1 + 1e-5) + 1e-12).all()
+            if other is shift:
+                np.testing.assert_allclose(sums, exact, rtol=1e-5)

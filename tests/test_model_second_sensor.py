@@ -108,6 +108,7 @@ def stand_in(folder):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_fine_tuning_to_a_second_sensor_beats_the_weights_it_started_from(tmp_path):
     """Four scenes of another camera, one of them held out: depth and normals of that one are better after a few minutes."""
     (tmp_path / "station.toml").write_text(DEFAULT.read_text() + SECOND + HALF_SIZE_STEREO)

@@ -80,9 +80,9 @@ def robust_chamfer(
     """
     p, q = p.float(), q.float()
     shifts = candidate_shifts(jitter).to(p)
-    items = [
+    items = [  # unbound, as the gradient of p[b] is a whole batch
         _item(
-            p[b],
+            one,
             q[b],
             p_mask[b, 0],
             q_mask[b, 0],
@@ -91,7 +91,7 @@ def robust_chamfer(
             None if normals is None else normals[b],
             softness,
         )
-        for b in range(len(p))
+        for b, one in enumerate(p.unbind())
     ]
     loss, candidates, winner = (torch.stack(x) for x in zip(*items, strict=True))
     return Chamfer(loss, candidates, winner)
@@ -108,11 +108,12 @@ def _item(
     softness: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Loss (), candidates (7,), winner () of one pair of clouds."""
-    if not (p_mask.any() and q_mask.any()):
+    window = _box(p_mask, q_mask)
+    if window is None:
         nothing = 0.0 * torch.where(p_mask, p, 0.0).sum()
         return nothing, shifts.new_zeros(len(shifts)), torch.zeros((), dtype=torch.int64, device=p.device)
 
-    box, corner = _box(p_mask | q_mask)
+    box, corner = window
     p, q, p_mask, q_mask = p[box], q[box], p_mask[box], q_mask[box]
     intrinsics, normals = intrinsics - corner.to(intrinsics), None if normals is None else normals[box]
 
@@ -144,11 +145,16 @@ def _compiled(device: torch.device) -> ModuleType | None:
     return next((search for search in (trees, tile_search) if search.usable(device)), None)
 
 
-def _box(mask: Tensor) -> tuple[tuple[EllipsisType, slice, slice], Tensor]:
-    """Window of (..., H, W) that holds a mask (H, W), and what it takes from fx, fy, cx, cy."""
-    rows, cols = mask.any(1).nonzero()[:, 0].tolist(), mask.any(0).nonzero()[:, 0].tolist()
-    window = (..., slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
-    return window, torch.tensor([0.0, 0.0, cols[0], rows[0]])
+def _box(p_mask: Tensor, q_mask: Tensor) -> tuple[tuple[EllipsisType, slice, slice], Tensor] | None:
+    """Window of (..., H, W) that holds two masks (H, W), and what it takes from fx, fy, cx, cy; None if one is empty."""
+    p_bytes, q_bytes = p_mask.view(torch.uint8), q_mask.view(torch.uint8)  # their amax is faster than any
+    of_p, of_q = p_bytes.amax(1), q_bytes.amax(1)
+    if not (of_p.any() and of_q.any()):
+        return None
+    rows = (of_p | of_q).nonzero()[:, 0].tolist()
+    high = slice(rows[0], rows[-1] + 1)
+    cols = (p_bytes[high] | q_bytes[high]).amax(0).nonzero()[:, 0].tolist()
+    return (..., high, slice(cols[0], cols[-1] + 1)), torch.tensor([0.0, 0.0, cols[0], rows[0]])
 
 
 def _directed(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Self
+from functools import partial
+from typing import Self, TypeVar
 
 import numpy as np
 import torch
@@ -15,8 +17,12 @@ from torch import Tensor
 from tofcapture.errors import ConfigError
 from tofcapture_model.neighbours import Found
 
-_PARTS = 16  # of the queries
-_RUN = 4  # leaves that stay together
+T = TypeVar("T")
+
+_SAMPLE = 32  # one of so many leaves is asked for every shift first,
+_TOGETHER = 4  # so many neighbours at a time
+_STEPS, _STEP = 16, 64  # at most so many steps in which other shifts are asked, of at least so many leaves
+_TASK = 64, 512  # leaves of a thread's task: least, most
 _WORTH_A_THREAD = 10_000  # queries of one shift
 _MARGIN = 1e-6  # of the largest coordinate: rounding of a shifted query
 
@@ -54,7 +60,7 @@ class Tree:
 
 def plant(cloud: Tensor, mask: Tensor) -> Tree:
     """Build the tree of the masked points of a cloud (3, H, W), metres; mask (H, W) is not empty."""
-    from tofcapture_model.kernels.boxes import FAN, fill, wrap
+    from tofcapture_model.kernels.boxes import FAN, fill, tidy, wrap
 
     points, there = np.ascontiguousarray(cloud.float().numpy()), np.ascontiguousarray(mask.numpy())
     n = int(np.count_nonzero(there))
@@ -65,62 +71,84 @@ def plant(cloud: Tensor, mask: Tensor) -> Tree:
     leaves, pixels = np.empty((levels[0], 3, FAN), np.float32), np.empty(n, np.int64)
     boxes = np.empty((offsets[-1], 6, FAN), np.float32)
     fill(points, there, leaves, pixels)
+    tidy(leaves, pixels)
     finite = leaves.reshape(-1)[np.isfinite(leaves.reshape(-1))]
     wrap(leaves, n, offsets, np.float32(_MARGIN * max(abs(finite.min()), abs(finite.max()))), boxes)
     return Tree(leaves, boxes, offsets, pixels)
 
 
 class _Shift:
-    """What is known of one shift: answers (2, H W) and the sums of their squares over the parts that were asked."""
+    """What is known of one shift: answers of P in Q (way 0) and of Q in P, in the order of the leaves of who asks."""
 
-    def __init__(self, trees: tuple[Tree, Tree], shift: Sequence[float], shape: tuple[int, int]) -> None:
-        self.trees, self.shape = trees, shape
-        x, y, z = shift
-        self.moves = [(np.float32(sign * x), np.float32(sign * y), np.float32(sign * z)) for sign in (1, -1)]
-        self.squared = np.full((2, shape[0] * shape[1]), np.inf, np.float32)
-        self.index = np.zeros((2, shape[0] * shape[1]), np.int64)
-        self.sums = np.zeros((2, _PARTS))
+    def __init__(self, trees: tuple[Tree, Tree], move: tuple[float, float, float]) -> None:
+        self.trees, self.move = trees, move
+        self.squared = [np.empty(len(tree.pixels), np.float32) for tree in trees]
+        self.whose = [np.empty(len(tree.pixels), np.int32) for tree in trees]
+        self.guesses = [np.empty(0, np.int32) for _ in trees]
+        # of the squares of a leaf; a bound from below until it is asked
+        self.sums = [np.zeros(len(tree.leaves)) for tree in trees]
 
-    def ask(self, way: int, first: int, last: int) -> None:
-        """Find the neighbours of some parts of P in Q (way 0) or of Q in P."""
+    def ask(self, way: int, which: NDArray[np.int64]) -> None:
+        """Find the neighbours of the points of some leaves, ascending."""
         from tofcapture_model.kernels.boxes import search
 
-        own, other = self.trees[way], self.trees[1 - way]
-        self.sums[way, first] = search(
-            other.leaves, other.boxes, other.offsets, other.pixels, own.leaves, own.pixels,
-            self.moves[way], (first, last, _PARTS), _RUN, self.squared[way], self.index[way],
+        own, other, sign = self.trees[way], self.trees[1 - way], 1 - 2 * way
+        x, y, z = (np.float32(sign * a) for a in self.move)
+        search(
+            other.leaves, other.boxes, other.offsets, own.leaves, (x, y, z), which,
+            self.guesses[way], self.squared[way], self.whose[way], self.sums[way],
         )  # fmt: skip
 
-    def seen(self) -> float:
-        """Symmetric mean squared distance, m^2, from below: what was not asked counts nothing."""
-        p, q = (len(tree.pixels) for tree in self.trees)
-        return float(self.sums[0].sum() / p + self.sums[1].sum() / q)
+    def learn(self, known: _Shift) -> None:
+        """Take the answers of another shift as guesses, and as bounds: none changes by more than the shift does."""
+        from tofcapture_model.kernels.boxes import bound
 
-    def found(self) -> Found:
+        apart = math.dist(self.move, known.move)
+        apart += _MARGIN * (math.hypot(*self.move) + math.hypot(*known.move))
+        self.guesses = known.whose
+        for sums, squared in zip(self.sums, known.squared, strict=True):
+            bound(squared, apart, sums)
+
+    def seen(self) -> float:
+        """Symmetric mean squared distance, m^2; from below until everything was asked."""
+        (p, q), (of_p, of_q) = self.trees, self.sums
+        return float(of_p.sum() / len(p.pixels) + of_q.sum() / len(q.pixels))
+
+    def found(self, shape: tuple[int, int]) -> Found:
         """Answers as tensors."""
-        return Found(
-            torch.from_numpy(self.squared).view(2, *self.shape),
-            torch.from_numpy(self.index).view(2, *self.shape),
-        )
+        from tofcapture_model.kernels.boxes import spread
+
+        size = shape[0] * shape[1]
+        squared, index = np.zeros((2, size), np.float32), np.zeros((2, size), np.int64)
+        for way in (0, 1):
+            own, other = self.trees[way].pixels, self.trees[1 - way].pixels
+            spread(own, other, self.squared[way], self.whose[way], squared[way], index[way])
+        return Found(torch.from_numpy(squared).view(2, *shape), torch.from_numpy(index).view(2, *shape))
 
 
 class _Crew:
-    """Threads that ask; the answers and their sums do not depend on how many there are."""
+    """Threads that share tasks; the answers do not depend on how many there are."""
 
-    def __init__(self, queries: int) -> None:
-        self.size = min(torch.get_num_threads(), 1 + queries // _WORTH_A_THREAD)
-        self.pool = ThreadPoolExecutor(self.size) if self.size > 1 else None
+    def __init__(self, p_mask: Tensor, q_mask: Tensor) -> None:
+        queries = int(np.count_nonzero(p_mask.numpy()) + np.count_nonzero(q_mask.numpy()))
+        size = min(torch.get_num_threads(), 1 + queries // _WORTH_A_THREAD)
+        self.pool = ThreadPoolExecutor(size) if size > 1 else None
 
-    def ask(self, shifts: Sequence[_Shift], first: int, last: int) -> None:
-        """Ask parts of both directions, a part at a time where there are many threads."""
-        step = 1 if self.size > 2 else last - first
-        tasks = [(s, way, k, min(k + step, last)) for s in shifts for way in (0, 1) for k in range(first, last, step)]  # fmt: skip
+    def do(self, tasks: Sequence[Callable[[], T]]) -> list[T]:
+        """Results of all tasks, in their order."""
         if self.pool is None:
-            for shift, *what in tasks:
-                shift.ask(*what)
-            return
-        for future in [self.pool.submit(shift.ask, *what) for shift, *what in tasks]:
-            future.result()
+            return [task() for task in tasks]
+        return [future.result() for future in [self.pool.submit(task) for task in tasks]]
+
+    def ask(self, shifts: Sequence[_Shift], which: Sequence[NDArray[np.int64]]) -> None:
+        """Ask some leaves of P and some of Q, ascending, for all shifts."""
+        least, most = _TASK
+        tasks = []
+        for way, leaves in enumerate(which):
+            n = min(max(len(leaves) // 8, least), most)
+            parts = [leaves[k : k + n] for k in range(0, len(leaves), n)]
+            tasks += [partial(shift.ask, way, part) for shift in shifts for part in parts]
+        self.do(tasks)
 
     def __enter__(self) -> Self:
         return self
@@ -130,13 +158,17 @@ class _Crew:
             self.pool.shutdown()
 
 
-def _plan(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> list[_Shift]:
-    trees, shape = (plant(p, p_mask), plant(q, q_mask)), (p_mask.shape[0], p_mask.shape[1])
-    return [_Shift(trees, shift, shape) for shift in shifts.tolist()]
+def _plan(crew: _Crew, p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> list[_Shift]:
+    tree_p, tree_q = crew.do([partial(plant, p, p_mask), partial(plant, q, q_mask)])
+    return [_Shift((tree_p, tree_q), (x, y, z)) for x, y, z in shifts.tolist()]
 
 
-def _queries(plans: Sequence[_Shift]) -> int:
-    return sum(len(tree.pixels) for tree in plans[0].trees)
+def _steps(best: _Shift) -> list[list[NDArray[np.int64]]]:
+    """Leaves of P and of Q in the order in which other shifts ask: bounds are loose where the best one's squares are large."""
+    weights = [sums / len(tree.pixels) for sums, tree in zip(best.sums, best.trees, strict=True)]
+    order, n = np.argsort(-np.concatenate(weights), kind="stable"), len(weights[0])
+    steps = np.array_split(order, min(max(len(order) // _STEP, 1), _STEPS))
+    return [[step[step < n], step[step >= n] - n] for step in map(np.sort, steps)]
 
 
 @torch.no_grad()
@@ -156,10 +188,10 @@ def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor
     -------
     One Found per shift
     """
-    plans = _plan(p, q, p_mask, q_mask, shifts)
-    with _Crew(_queries(plans)) as crew:
-        crew.ask(plans, 0, _PARTS)
-    return [plan.found() for plan in plans]
+    with _Crew(p_mask, q_mask) as crew:
+        plans = _plan(crew, p, q, p_mask, q_mask, shifts)
+        crew.ask(plans, [np.arange(len(tree.leaves)) for tree in plans[0].trees])
+    return [plan.found((p.shape[1], p.shape[2])) for plan in plans]
 
 
 @torch.no_grad()
@@ -168,25 +200,28 @@ def nearest_of_best(
 ) -> tuple[int, Found, Tensor]:
     """Find the shift of the least symmetric mean squared distance, and its neighbours, exactly (arguments as :func:`nearest`).
 
-    Squares only add up: a shift whose sum over some of the queries is above the best one's over all cannot win.
+    A sample tells which shift is probably the best, and that one is asked everything. By the triangle inequality its answers
+    bound those of the others from below; answers take the place of bounds until the sum is above the best one's, which proves
+    that the shift cannot win.
 
     Returns
     -------
     index of the shift, its Found, (S,) m^2: its distance, and for every other shift a bound from below that is not less
     """
-    plans = _plan(p, q, p_mask, q_mask, shifts)
-    with _Crew(_queries(plans)) as crew:
-        crew.ask(plans, 0, 1)
+    with _Crew(p_mask, q_mask) as crew:
+        plans = _plan(crew, p, q, p_mask, q_mask, shifts)
+        sampled = [np.arange(len(tree.leaves)) // _TOGETHER % _SAMPLE == 0 for tree in plans[0].trees]
+        crew.ask(plans, [there.nonzero()[0] for there in sampled])
         best, *others = sorted(plans, key=_Shift.seen)
-        crew.ask([best], 1, _PARTS)
+        crew.ask([best], [(~there).nonzero()[0] for there in sampled])
         for plan in others:
-            asked = 1
-            while asked < _PARTS and plan.seen() < best.seen():
-                enough = (
-                    int(asked * best.seen() / max(plan.seen(), 1e-30)) + 1
-                )  # where the rest is like what was seen
-                first, asked = asked, min(max(enough, asked + 1), _PARTS)
-                crew.ask([plan], first, asked)
-            if plan.seen() < best.seen():
-                best = plan
-    return plans.index(best), best.found(), torch.tensor([plan.seen() for plan in plans], dtype=torch.float32)
+            plan.learn(best)
+        least = best.seen()
+        for step in _steps(best):
+            others = [plan for plan in others if plan.seen() < least]
+            if not others:
+                break
+            crew.ask(others, step)
+    best = min([best, *others], key=_Shift.seen)
+    bounds = torch.tensor([plan.seen() for plan in plans], dtype=torch.float32)
+    return plans.index(best), best.found((p.shape[1], p.shape[2])), bounds

@@ -12,12 +12,16 @@ from numpy.typing import NDArray
 from tofcapture.compiled import compiled
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 Point = tuple[np.float32, np.float32, np.float32]
 
 FAN = 16
 _ZERO, _INF, _ONE, _TINY = np.float32(0), np.float32(np.inf), np.uint32(1), np.float32(1e-12)
+_SLACK = 1e-6  # of a distance: its rounding
+_DEEP = np.float32(1.5)  # times as long along the rays as across: a depth step
+_BISECTIONS = 10  # of the range of a node's points
 _ALIKE = np.float32(4)  # times the mean square of the others: farther away than that, a query looks alone
 _FACTOR, _TOP = (
     np.uint32(0x077CB531),
@@ -52,6 +56,82 @@ def fill(cloud: Float32, mask: NDArray[np.bool_], leaves: Float32, pixels: Int64
                     n += 1
     for i in range(n, len(leaves) * FAN):
         leaves[i // FAN, :, i % FAN] = _INF
+
+
+@compiled
+def _ranges(points: Float32, first: int, last: int) -> tuple[Point, Point]:
+    """Box of the points (3, N) from first to last - 1."""
+    low, high = (_INF, _INF, _INF), (-_INF, -_INF, -_INF)
+    for i in range(first, last):
+        x, y, z = points[0, i], points[1, i], points[2, i]
+        low = (min(low[0], x), min(low[1], y), min(low[2], z))
+        high = (max(high[0], x), max(high[1], y), max(high[2], z))
+    return low, high
+
+
+@compiled
+def _halve(keys: Float32, low: np.float32, high: np.float32, middle: int, order: Int64) -> None:
+    """Order of keys, which lie from low to high, that puts the ``middle`` least of them first, nearly, and else keeps theirs.
+
+    No branch depends on a key, which makes this faster than a quickselect.
+    """
+    fewer = 0
+    for _ in range(_BISECTIONS):
+        pivot, count = np.float32(0.5) * (low + high), 0
+        for key in keys:
+            count += key < pivot
+        if count <= middle:
+            low, fewer = pivot, count
+        else:
+            high = pivot
+    room, left, right = middle - fewer, 0, middle
+    for i in range(len(keys)):
+        between = (keys[i] >= low) & (keys[i] <= high) & (room > 0)
+        goes = between | (keys[i] < low)
+        room -= between
+        order[left if goes else right] = i
+        left += goes
+        right += not goes
+
+
+@compiled
+def tidy(leaves: Float32, pixels: Int64) -> None:
+    """Share out the points of a node among its leaves anew where one reaches across a depth step: halves along the longest axis.
+
+    Blocks of pixels there are long along the rays, and long boxes are near to everything.
+    """
+    block = FAN * FAN
+    points, moved = np.empty((3, block), np.float32), np.empty((3, block), np.float32)
+    order, names = np.empty(block, np.int64), np.empty(block, np.int64)
+    for start in range(0, len(pixels), block):
+        n, deep = min(block, len(pixels) - start), False
+        for i in range(n):
+            for a in range(3):
+                points[a, i] = leaves[(start + i) // FAN, a, i % FAN]
+        for first in range(0, n, FAN):
+            low, high = _ranges(points, first, min(first + FAN, n))
+            if high[2] - low[2] > _DEEP * max(high[0] - low[0], high[1] - low[1]):
+                deep = True
+        if not deep:
+            continue
+        width = block
+        while width > FAN:
+            for first in range(0, n - width // 2, width):
+                m = min(width, n - first)
+                low, high = _ranges(points, first, first + m)
+                x, y, z = high[0] - low[0], high[1] - low[1], high[2] - low[2]
+                axis = 0 if x >= max(y, z) else 1 if y >= z else 2
+                _halve(points[axis, first : first + m], low[axis], high[axis], width // 2, order)
+                for i in range(m):
+                    names[i] = pixels[start + first + order[i]]
+                    for a in range(3):
+                        moved[a, i] = points[a, first + order[i]]
+                pixels[start + first : start + first + m] = names[:m]
+                points[:, first : first + m] = moved[:, :m]
+            width //= 2
+        for i in range(n):
+            for a in range(3):
+                leaves[(start + i) // FAN, a, i % FAN] = points[a, i]
 
 
 @compiled
@@ -157,7 +237,7 @@ def _descend(
 ) -> tuple[np.float32, int]:  # fmt: skip
     """Look at all leaves whose box is nearer than what is known; ``node`` and ``open_`` (levels,) are for its use."""
     moved = p[0] + s[0], p[1] + s[1], p[2] + s[2]
-    first, levels = at // FAN, len(offsets) - 1
+    levels = len(offsets) - 1
     level = levels - 1
     node[level], open_[level] = 0, _boxes_near(boxes, offsets[level], moved, moved, best)
     while level < levels:
@@ -170,7 +250,7 @@ def _descend(
         if level > 0:
             level -= 1
             node[level], open_[level] = child, _boxes_near(boxes, offsets[level] + child, moved, moved, best)
-        elif child != first:
+        else:
             best, at = _look(leaves, child, p, s, best, at)
     return best, at
 
@@ -252,75 +332,101 @@ def _descend_all(
 
 
 @compiled
-def _take(
-    own: Float32, g: int, count: int, s: Point, of: Float32, moved: Float32, best: Float32
-) -> tuple[Point, Point]:
-    """Fill ``of`` with the queries of a leaf, and ``moved`` with them + s; returns the box of these. Empty places hold the first."""
+def _take(own: Float32, g: int, count: int, s: Point, of: Float32, moved: Float32) -> None:
+    """Fill ``of`` with the queries of a leaf, and ``moved`` with them + s. Empty places hold the first."""
     for k in range(FAN):
-        best[k] = _INF
         for a in range(3):
             of[a, k] = own[g, a, k if k < count else 0]
             moved[a, k] = of[a, k] + s[a]
-    low, high = (moved[0, 0], moved[1, 0], moved[2, 0]), (moved[0, 0], moved[1, 0], moved[2, 0])
-    for k in range(1, FAN):
-        x, y, z = moved[0, k], moved[1, k], moved[2, k]
-        low = (min(low[0], x), min(low[1], y), min(low[2], z))
-        high = (max(high[0], x), max(high[1], y), max(high[2], z))
+
+
+@compiled
+def _recall(leaves: Float32, guesses: Int32, of: Float32, s: Point, best: Float32, at: Int32) -> np.float32:
+    """Start sixteen queries ``of`` + s (the first for empty places) at a guess of each; returns the largest squared distance."""
+    most = _ZERO
+    for k in range(FAN):
+        i = guesses[k if k < len(guesses) else 0]
+        at[k] = i
+        best[k] = _between(_point(leaves, i // FAN, i % FAN), (of[0, k], of[1, k], of[2, k]), s)
+        most = max(most, best[k])
+    return most
+
+
+@compiled
+def _part(moved: Float32, reach: np.float32, best: Float32, alone: Float32) -> tuple[Point, Point]:
+    """Box of the queries that are not beyond reach; what the others have goes to ``alone`` (16,), so that none looks for them."""
+    low, high = (_INF, _INF, _INF), (-_INF, -_INF, -_INF)
+    for k in range(FAN):
+        if best[k] > reach:
+            alone[k], best[k] = best[k], -_INF
+        else:
+            alone[k] = -_INF
+            x, y, z = moved[0, k], moved[1, k], moved[2, k]
+            low = (min(low[0], x), min(low[1], y), min(low[2], z))
+            high = (max(high[0], x), max(high[1], y), max(high[2], z))
     return low, high
 
 
 @compiled
 def search(
-    leaves: Float32, boxes: Float32, offsets: Int64, names: Int64, own: Float32, own_names: Int64,
-    shift: Point, parts: tuple[int, int, int], run: int, squared: Float32, index: Int64,
-) -> float:  # fmt: skip
-    """Nearest of the tree ``leaves, boxes, offsets`` to the points of leaves ``own`` + shift; returns the sum of squares, m^2.
+    leaves: Float32, boxes: Float32, offsets: Int64, own: Float32, shift: Point, which: Int64, guesses: Int32,
+    squared: Float32, whose: Int32, sums: Float64,
+) -> None:  # fmt: skip
+    """Nearest of the tree ``leaves, boxes, offsets`` to the points of some leaves of ``own`` + shift.
 
-    ``parts`` are first, last + 1 and how many there are: runs of so many leaves belong to the parts in turns. ``names`` and
-    ``own_names`` are the pixels of both clouds; ``squared`` and ``index`` (H W,) are written at those of the queries. The
-    queries of a leaf look together, first where the leaf before, their neighbour on the grid, had its answer; those that
-    are much farther away from everything than the others go on alone.
+    ``which`` are these leaves, ascending; ``guesses`` are answers to another shift (N,), or none. ``squared``, m^2, and
+    ``whose`` (N,) are written at the points of these leaves, and ``sums`` of the squares (L,) at the leaves. The queries of a
+    leaf look together, first where the leaf before, their neighbour on the grid, had its answer; those that are much farther
+    away from everything than the others go on alone.
     """
     node, open_ = np.zeros(len(offsets), np.int64), np.zeros(len(offsets), np.uint32)
     of, moved = np.empty((3, FAN), np.float32), np.empty((3, FAN), np.float32)
-    best, at = np.empty(FAN, np.float32), np.empty(FAN, np.int32)
-    n, there, before, total = len(own_names), -1, _INF, 0.0
-    for g in range(len(own)):
-        part = (g // run) % parts[2]
-        if part < parts[0] or part >= parts[1]:
-            there = -1
-            continue
+    best, at, alone = np.empty(FAN, np.float32), np.empty(FAN, np.int32), np.empty(FAN, np.float32)
+    n, there, before = len(squared), -1, _INF
+    for g in which:
         count = min(FAN, n - FAN * g)
-        low, high = _take(own, g, count, shift, of, moved, best)
-        first, most = there, _INF
+        _take(own, g, count, shift, of, moved)
+        first, most, best[:] = there, _INF, _INF
+        if len(guesses) > 0:
+            most = _recall(leaves, guesses[FAN * g : FAN * g + count], of, shift, best, at)
         if there >= 0:
             most = _look_all(leaves, there, of, shift, best, at)
-        if there < 0 or most > FAN * before:  # across a depth step: look there first, lest much be nearer
+        if len(guesses) == 0 and (there < 0 or most > FAN * before):
+            # across a depth step: look there first, lest much be nearer
             first = _likeliest(boxes, offsets, moved[0, 0], moved[1, 0], moved[2, 0])
             most = _look_all(leaves, first, of, shift, best, at)
+        reach = _reach(best, most)
+        low, high = _part(moved, reach, best, alone)
         reach = _descend_all(
-            leaves,
-            boxes,
-            offsets,
-            node,
-            open_,
-            of,
-            moved,
-            shift,
-            low,
-            high,
-            first,
-            _reach(best, most),
-            best,
-            at,
+            leaves, boxes, offsets, node, open_, of, moved, shift, low, high, first, reach, best, at
         )
+        total = 0.0
         for k in range(count):
-            near, whose = best[k], int(at[k])
-            if near > reach:
+            near, i = best[k], int(at[k])
+            if alone[k] > 0:
                 point = (of[0, k], of[1, k], of[2, k])
-                near, whose = _descend(leaves, boxes, offsets, node, open_, point, shift, near, whose)
-            name = own_names[FAN * g + k]
-            squared[name], index[name] = near, names[whose]
+                near, i = _descend(leaves, boxes, offsets, node, open_, point, shift, alone[k], i)
+            squared[FAN * g + k], whose[FAN * g + k] = near, i
             total += float(near)
+        sums[g] = total
         there, before = int(at[FAN // 2]) // FAN, max(reach, _TINY)
-    return total
+
+
+@compiled
+def bound(squared: Float32, away: float, sums: Float64) -> None:
+    """Raise sums (L,) to what squares must at least add up to ``away`` metres from where they are these (N,)."""
+    for g in range(len(sums)):
+        total = 0.0
+        for i in range(FAN * g, min(FAN * g + FAN, len(squared))):
+            least = max(np.sqrt(float(squared[i])) * (1.0 - _SLACK) - away, 0.0)
+            total += least * least
+        sums[g] = max(sums[g], total)
+
+
+@compiled
+def spread(
+    own: Int64, other: Int64, squared: Float32, whose: Int32, squared_image: Float32, index_image: Int64
+) -> None:
+    """Write answers to the pixels of who asked; ``own`` and ``other`` are the pixels of both clouds."""
+    for i in range(len(own)):
+        squared_image[own[i]], index_image[own[i]] = squared[i], other[whose[i]]
