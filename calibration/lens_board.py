@@ -133,7 +133,12 @@ def fit_lens_to_board(model: Model, views: Sequence[BoardSeen], camera: Camera) 
     thin = [replace(v, pixels=v.pixels[:: max(1, len(v.pixels) // FEW)]) for v in views]
     best: BoardLens | None = None
     for name, free in MODELS.items():
-        found = _fit(model, thin, best.camera if best else camera, name, free)
+        try:
+            found = _fit(model, thin, best.camera if best else camera, name, free)
+        except ConfigError:  # it folds: the views do not ask for that much lens
+            if best is None:
+                raise
+            break
         if best is None or _rms(found.left_out) < BETTER * _rms(best.left_out):
             best = found
     if best is None or best.rms > 1.0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tofcapture.command import Outcome
-from tofcapture.errors import QualityError
+from tofcapture.errors import ConfigError, QualityError
 
 if TYPE_CHECKING:
     from calibration.board import Board
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 GOOD = {"rms": 0.4, "left_out": 0.5, "pixel_sigma": 0.3, "coverage": 0.75}
 BEARABLE = {"rms": 0.8, "left_out": 1.0, "pixel_sigma": 1.0, "coverage": 0.5}
+WORSE = 1.2  # times the first look's error: one of the boards found in addition is another one
 CAUSES = {
     "rms": "a bent board, another board's file, or a camera that moved during the exposure",
     "left_out": "too few views for this lens, or one bad view",
@@ -51,7 +53,9 @@ def run(args: argparse.Namespace) -> Outcome:
     if refused:  # with a wrong lens a board may look like another one: once more with the one that was found
         again, still = seen_boards(recording, board, replace(rig, tof=fit.camera))
         if len(again) > len(views):
-            refused, fit = still, fit_lens_to_board(Model(board), again, rig.tof)
+            with suppress(ConfigError, QualityError):  # the first fit stands
+                second = fit_lens_to_board(Model(board), again, rig.tof)
+                refused, fit = (still, second) if second.rms < WORSE * fit.rms else (refused, fit)
     data = {**report(fit, rig), "refused": refused}
     if not args.dry_run:
         write_atomically(recording / "lens.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
@@ -139,7 +143,9 @@ def report(fit: BoardLens, rig: Rig) -> dict[str, Any]:
 
 def table(data: dict[str, Any]) -> str:
     """Lay a report out for a person."""
-    held = data["model"] == "pinhole" and data["lens"]["k1"]["value"]
+    held = data["model"] == "pinhole" and any(
+        data["lens"][k]["value"] for k in ("k1", "k2", "p1", "p2", "k3")
+    )
     model = "distortion as before" if held else data["model"]
     lines = [f"{data['views']} views, {len(data['refused'])} refused; lens: {model}"]
     lines += [

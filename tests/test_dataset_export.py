@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.test_dataset_card import make
+from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.dataset import export as exporting
 from tofcapture.dataset.export import UNIT, check_export, export
@@ -191,3 +192,13 @@ def test_png_is_what_a_decoder_reads():
     for image, back in ((grey, slice(None)), (colour, (..., slice(None, None, -1)))):
         data = np.frombuffer(png_bytes(image), np.uint8)
         assert (cv2.imdecode(data, cv2.IMREAD_UNCHANGED)[back] == image).all()
+
+
+def test_a_lens_is_told_as_plumb_bob():
+    """Foxglove and ROS have the same five coefficients in the same order; a pinhole has zeros."""
+    from tofcapture.dataset.export_mcap import _calibration
+
+    lens = (-0.18, 0.05, 0.001, -0.0008, 0.002)
+    told = _calibration(Camera(240, 180, 190.0, 200.0, 117.0, 101.0, lens))
+    assert (told["distortion_model"], told["D"]) == ("plumb_bob", list(lens))
+    assert _calibration(Camera(240, 180, 190.0, 200.0, 117.0, 101.0))["D"] == [0.0] * 5

@@ -179,3 +179,11 @@ def test_bundled_weights_are_exported_to_here(quick, tmp_path, monkeypatch):
         assert main(["export", *words]) == 0
         (tmp_path / "model.onnx").unlink()
     assert not weights.with_suffix(".onnx").exists()
+
+
+@pytest.mark.parametrize("kind", ["su2018", "guo2018", "coarse-fine"])
+def test_baselines_are_exported_for_any_batch(kind, tmp_path):
+    """One and three frames at once are held against torch before the export is kept."""
+    told = export(network(tmp_path, kind), tmp_path / "model.onnx", size=SIZE)
+    assert told["differences"]["depth_2x"] < 1e-3
+    assert (tmp_path / "model.onnx").exists()

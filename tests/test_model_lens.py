@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,19 +19,21 @@ from tests.test_model_predict import saved
 from tests.test_model_predict_inputs import SMALL, save_network, wall
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError
+from tofcapture.frames import TofInfo
 from tofcapture.rig import Rig, dumps_rig
-from tofcapture_model import neighbours
+from tofcapture_model import neighbours, onnx_backend
 from tofcapture_model import predict as predicting
 from tofcapture_model.augment import RawItem
 from tofcapture_model.augment import crop as crop_item
 from tofcapture_model.augment import flip as flip_item
 from tofcapture_model.chamfer import candidate_shifts, robust_chamfer
 from tofcapture_model.config import Config, Network, Stage, preset
-from tofcapture_model.data import FrameDataset, collate, crop, mirror
+from tofcapture_model.data import FrameDataset, collate, crop, frame_decoder, mirror
 from tofcapture_model.evaluate import evaluate
 from tofcapture_model.geometry import depth_to_normals, propagate_depth, unproject
 from tofcapture_model.intrinsics import (
     cut_intrinsics,
+    expect_usable,
     intrinsics_of,
     mirror_intrinsics,
     rays,
@@ -39,7 +42,9 @@ from tofcapture_model.intrinsics import (
     with_lens,
 )
 from tofcapture_model.multipath import cues
-from tofcapture_model.predict import predict
+from tofcapture_model.predict import Predictor, predict
+from tofcapture_model.raw_input import NOMINAL_CAMERA
+from tofcapture_model.torch_decoder import TorchDecoder
 from tofcapture_model.train import train
 
 PLAIN = Camera(120, 90, 95.0, 100.0, 58.4, 50.7)
@@ -67,29 +72,77 @@ def degrees(found, expected):
     return torch.rad2deg(torch.atan2(apart, (found * expected).sum(1)))
 
 
-@settings(max_examples=25, deadline=None)
-@given(
-    st.floats(35, 100),
-    st.tuples(
-        st.floats(-0.4, 0.4),
-        st.floats(-0.15, 0.15),
-        st.floats(-0.005, 0.005),
-        st.floats(-0.005, 0.005),
-        st.floats(-0.1, 0.1),
-    ),
-)
-def test_rays_are_the_cameras(focal, distortion):
-    """For every lens that a camera takes, at the sensor's resolution and at twice that."""
-    camera = Camera(60, 45, focal, 1.03 * focal, 28.4, 23.7, distortion)
+def usable(camera):
+    """The camera, unless it or the networks refuse its lens."""
     try:
-        expected = rays_of(camera)
+        expect_usable(camera)
     except ConfigError:
         assume(False)
-    torch.testing.assert_close(rays(numbers(camera), *camera.shape), expected, atol=3e-5, rtol=0)
-    fine = scale_intrinsics(numbers(camera), 2)
-    torch.testing.assert_close(
-        rays(fine, *camera.scaled(2).shape), rays_of(camera.scaled(2)), atol=1e-4, rtol=0
+    return camera
+
+
+@st.composite
+def lenses(draw):
+    """Lenses as calibrations give them, most with two coefficients that matter; many of them fold somewhere outside the image."""
+    k1, k2 = draw(st.floats(-0.4, 0.2)), draw(st.sampled_from([0.0, 0.01, 0.05, -0.05, 0.1]))
+    p1, p2, k3 = (
+        draw(st.floats(-0.005, 0.005)),
+        draw(st.floats(-0.005, 0.005)),
+        draw(st.sampled_from([0.0, -0.03])),
     )
+    focal = draw(st.floats(42, 100))
+    try:
+        return Camera(60, 45, focal, 1.03 * focal, 28.4, 23.7, (k1, k2, p1, p2, k3))
+    except ConfigError:
+        assume(False)
+
+
+@settings(max_examples=30, deadline=None)
+@given(lenses())
+def test_rays_are_the_cameras(camera):
+    """For every lens that is not refused, at the sensor's resolution and at twice that."""
+    usable(camera)
+    close = {"atol": 1e-4, "rtol": 0}
+    torch.testing.assert_close(rays(numbers(camera), *camera.shape), rays_of(camera), **close)
+    fine = scale_intrinsics(numbers(camera), 2)
+    torch.testing.assert_close(rays(fine, *camera.scaled(2).shape), rays_of(camera.scaled(2)), **close)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Camera(60, 45, 35.9, 35.9, 28.4, 23.7, (-0.278, -0.065, -0.002, -0.002, 0.044)),
+        replace(NOMINAL_CAMERA, distortion=(-0.2215, 0.0, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_a_lens_that_nearly_folds_is_refused_before_anything_is_computed(lens):
+    """Both are rays that the camera can still compute at its own resolution: wrong in eight steps, or folded at twice the resolution."""
+    lens.rays  # noqa: B018
+    with pytest.raises(ConfigError, match="fold"):
+        frame_decoder(TofInfo("t", "", lens, np.zeros(3)), lens)
+    with pytest.raises(ConfigError, match="fold"):
+        TorchDecoder(TofInfo("t", "", lens, np.zeros(3)), lens, torch.device("cpu"))
+
+
+@settings(max_examples=25, deadline=None)
+@given(lenses())
+def test_every_cue_is_finite_for_every_lens(camera):
+    """Also what is expected of the scene beyond the image, where most lenses fold."""
+    depth, _ = tilted(usable(camera), (0.0, 0.0, -1.0))
+    phasor = torch.full((1, 4, *camera.shape), 0.02)
+    found = cues(phasor, depth, torch.ones_like(depth), torch.zeros_like(depth), numbers(camera), 1e8)
+    assert found.isfinite().all()
+    assert found[:, :2].abs().max() < 0.1
+
+
+@pytest.mark.parametrize("k1", [-0.1, -0.15, -0.2, 0.1])
+def test_the_bundled_network_answers_through_one_coefficient(k1):
+    """As calibrations often give it: these fold outside the image, and inside all is well."""
+    lens = replace(NOMINAL_CAMERA, distortion=(k1, 0.0, 0.0, 0.0, 0.0))
+    found = Predictor()(wall(lens), TofInfo("t", "", lens, np.zeros(3)))
+    assert np.abs(found.depth - 0.8).mean() < 0.02
+    assert np.isfinite(found.normals).all()
+    assert np.isfinite(found.error).all()
 
 
 def test_windows_mirrors_and_every_tenth_pixel_keep_their_rays():
@@ -144,16 +197,18 @@ def test_expected_interreflection_does_not_depend_on_the_lens():
             [torch.zeros(1, 2, *camera.shape), amplitude * phase.cos(), amplitude * phase.sin()], 1
         )
         seen = cues(phasor, depth, torch.ones_like(depth), torch.zeros_like(depth), numbers(camera), 1e8)
-        maps.append(seen[0, 0])
+        maps.append(seen[0, :2])
     x, y, _ = rays_of(LENS)[0]
     grid = torch.stack(
         [(x * PLAIN.fx + PLAIN.cx + 0.5) / 60 - 1, (y * PLAIN.fy + PLAIN.cy + 0.5) / 45 - 1], -1
     )
-    there = torch.nn.functional.grid_sample(maps[0][None, None], grid[None], align_corners=False)[0, 0]
+    there = torch.nn.functional.grid_sample(maps[0][None], grid[None], align_corners=False)[0]
     inside = (grid.abs() < 0.75).all(-1)
     inside &= torch.from_numpy(np.hypot(*np.mgrid[-45:45, -60:60]) < 50)
     assert maps[0].max() > 0.01
-    assert ((maps[1] - there)[inside].abs().mean() / there[inside].mean()) < 0.08
+    # what is seen differs with the field of view; continued beyond the image, it is the same scene
+    for of, limit in ((0, 0.08), (1, 0.03)):
+        assert (maps[1] - there)[of][inside].abs().mean() / there[of][inside].mean() < limit
 
 
 def test_the_search_in_a_grid_is_exact_through_a_lens():
@@ -237,10 +292,14 @@ def test_cameras_with_and_without_a_lens_share_a_batch(seen):
 def test_networks_learn_and_are_measured_through_a_lens(seen, tmp_path, kind):
     """Both networks train on both cameras; what is measured of the sensor through the lens is what is measured through a pinhole."""
     base = preset("demo")
-    network = replace(base.network, width=4, levels=2) if kind == "compact" else Network(width=4, levels=2)
+    network = (
+        replace(base.network, width=4, levels=2)
+        if kind == "compact"
+        else Network(width=4, levels=2, refine_iterations=1)
+    )
     config = Config(
         network=network,
-        losses=replace(base.losses, chamfer=0.1),
+        losses=replace(base.losses, chamfer=0.1 if kind == "compact" else 0.0),
         training=replace(base.training, batch=2, crop=(48, 64)),
         stages=(Stage("joint", 1, 1e-3),),
     )
@@ -281,3 +340,35 @@ def test_an_export_takes_any_lens(tmp_path, monkeypatch):
     model = onnx.load(str(exported))
     place = next(i for i in model.graph.input if i.name == "intrinsics")
     assert place.type.tensor_type.shape.dim[1].dim_value == 9
+
+
+def test_an_export_made_before_lenses_were_known_says_what_to_do(tmp_path, monkeypatch):
+    """It takes four numbers; a pinhole it answers as before."""
+    pytest.importorskip("onnxruntime")
+
+    class Old:
+        def get_inputs(self):
+            return [
+                SimpleNamespace(name=n, shape=["batch", k, *SMALL.shape])
+                for n, k in (("raw", 8), ("intrinsics", 4))
+            ]
+
+        def run(self, names, feed):
+            assert feed["intrinsics"].shape == (1, 4)
+            shape = (1, 1, *SMALL.scaled(2).shape)
+            return [
+                np.ones(shape, np.float32),
+                np.ones((1, 3, *shape[2:]), np.float32),
+                np.ones(shape, np.float32),
+            ]
+
+    weights = save_network(tmp_path, preset("demo"))
+    weights.with_suffix(".onnx").write_bytes(b"")
+    monkeypatch.setattr(onnx_backend, "open_onnx", lambda _: Old())
+    monkeypatch.setattr(onnx_backend, "config_of", lambda *_: preset("demo"))
+    ask = Predictor(weights, backend="onnx")
+    assert ask(wall(SMALL), TofInfo("t", "", SMALL, np.zeros(3))).depth.shape == (72, 96)
+    lens = replace(SMALL, distortion=(-0.1, 0.02, 0.001, 0.002, 0.0))
+    with pytest.raises(ConfigError, match="without lens distortion") as caught:
+        ask(wall(lens), TofInfo("t", "", lens, np.zeros(3)))
+    assert "export" in caught.value.hint

@@ -162,7 +162,7 @@ class Camera:
         if self.distortion:
             raise ConfigError(
                 f"{where}: expected an image without distortion, got k1 {self.distortion[0]:.4g} and more",
-                hint="rectify the image (cv2.undistort) and give the rectified intrinsics",
+                hint="give the intrinsics of the rectified grid, as the stereo camera's own software does",
             )
         return self
 

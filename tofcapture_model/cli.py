@@ -299,7 +299,7 @@ def _predict(args: argparse.Namespace) -> Outcome:
     size = " x ".join(str(n) for n in reversed(result["shape"]))
     told = result["median_expected_error"] is not None
     what = "depth, normals and expected error" if told else "depth and normals"
-    text = f"{args.out}: {what} at {size}, network took {result['inference_ms']:.0f} ms"
+    text = f"{args.out}: {what} at {size}, {'decoding and network' if args.device != 'cpu' else 'network'} took {result['inference_ms']:.0f} ms"
     if not told:
         text += f"\nno expected error: {result['network']} predicts none"
     if result["filled"]:

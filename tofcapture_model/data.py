@@ -25,7 +25,13 @@ from tofcapture.ops.phase import Decoder, TapNoise, frequencies, photon_transfer
 from tofcapture.ops.phase.float32 import tap_weights
 from tofcapture_model.augment import BurstNoise
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, NO_MAPS, Frame, Target
-from tofcapture_model.intrinsics import cut_intrinsics, intrinsics_of, mirror_intrinsics, with_lens
+from tofcapture_model.intrinsics import (
+    cut_intrinsics,
+    expect_usable,
+    intrinsics_of,
+    mirror_intrinsics,
+    with_lens,
+)
 from tofcapture_model.multipath import cues
 from tofcapture_model.raw_input import taken
 from tofcapture_model.shards import SampleId, all_samples, open_scenes
@@ -101,7 +107,8 @@ def with_cues(frame: Frame, hz: float) -> Frame:
 
 
 def frame_decoder(info: TofInfo, camera: Camera) -> Decoder:
-    """Tables for :func:`make_frame`, by the calibrated intrinsics."""
+    """Tables for :func:`make_frame`, by the calibrated intrinsics; refuses a lens that cannot be used."""
+    expect_usable(camera)
     return Decoder(replace(info, camera=camera))
 
 

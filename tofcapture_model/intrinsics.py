@@ -6,19 +6,45 @@ behind them, as :class:`tofcapture.camera.Camera` has them. Networks see images 
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture.camera import Camera
+from tofcapture.errors import ConfigError
 
 PINHOLE, LENS = 4, 9
-_NEWTON_STEPS = 8  # four do for most lenses; those that nearly fold at a corner take all to come within 1e-5
+_NEWTON_STEPS = (
+    8  # four do for most lenses; what nearly folds at a corner would take many more, and is refused
+)
+_INVERTED = 1e-4  # of a ray's x and y at z = 1
 
 
 def intrinsics_of(camera: Camera) -> Tensor:
     """(4,) float32 of a pinhole, (9,) of a camera with a lens."""
     return torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+
+
+def expect_usable(camera: Camera) -> None:
+    """Refuse a lens whose rays the networks would get wrong, at the sensor's resolution or at twice that; takes a fraction of a second.
+
+    Raises
+    ------
+    ConfigError
+        The lens folds, or nearly so, at the image's border.
+    """
+    if not camera.distortion:
+        return
+    for scale in (1, 2):
+        fine = camera.scaled(scale)  # its outermost rays lie a quarter of a pixel further out
+        found = rays(scale_intrinsics(intrinsics_of(camera)[None], scale), *fine.shape)[0].permute(1, 2, 0)
+        off = float(np.nan_to_num(np.abs(found.numpy() - fine.rays), nan=np.inf).max())
+        if off > _INVERTED:
+            raise ConfigError(
+                f"lens: the distortion {[float(f'{c:.4g}') for c in camera.distortion]} nearly folds at the image's border: rays come out {off:.2g} wrong",
+                hint="no lens does that: calibrate again with targets in the corners of the image, or with fewer coefficients",
+            )
 
 
 def with_lens(intrinsics: Tensor) -> Tensor:
@@ -32,10 +58,10 @@ def scale_intrinsics(intrinsics: Tensor, s: int) -> Tensor:
     return torch.cat([f * s, (c + 0.5) * s - 0.5, lens], dim=1)
 
 
-def thin_intrinsics(intrinsics: Tensor, step: int, margin: int = 0) -> Tensor:
-    """Intrinsics (B, 4 or 9) of every ``step``-th pixel, from pixel ``step // 2`` on, with ``margin`` more of them at each border."""
+def thin_intrinsics(intrinsics: Tensor, step: int) -> Tensor:
+    """Intrinsics (B, 4 or 9) of every ``step``-th pixel, from pixel ``step // 2`` on."""
     f, c, lens = intrinsics[:, :2], intrinsics[:, 2:PINHOLE], intrinsics[:, PINHOLE:]
-    return torch.cat([f / step, (c - step // 2) / step + margin, lens], dim=1)
+    return torch.cat([f / step, (c - step // 2) / step, lens], dim=1)
 
 
 def cut_intrinsics(intrinsics: Tensor, top: int, left: int) -> Tensor:
@@ -61,7 +87,7 @@ def mirror_intrinsics(intrinsics: Tensor, axis: int, size: int) -> Tensor:
 def rays(intrinsics: Tensor, height: int, width: int) -> Tensor:
     """(B, 3, H, W) rays through the pixel centres with z = 1, from intrinsics (B, 4 or 9).
 
-    A lens is inverted by Newton's method in the given dtype; that it can be inverted, :class:`tofcapture.camera.Camera` has made sure of.
+    A lens is inverted by Newton's method in the given dtype, inside the image only: :func:`expect_usable` makes sure of it.
     """
     fx, fy, cx, cy = (intrinsics[:, i, None, None] for i in range(PINHOLE))
     v, u = torch.meshgrid(

@@ -141,10 +141,7 @@ def exchange_error(
     maps = surfaces[:, :, step // 2 :: step, step // 2 :: step]
     h, w = maps.shape[-2:]
     around = F.pad(maps, (margin, margin, margin, margin), mode="replicate")
-    grid = thin_intrinsics(intrinsics, step, margin)
-    r = rays(grid, *around.shape[-2:])
-    ux, uy, vx, vy = pixel_slopes(grid, *r[:, :2].unbind(1))
-    density = (ux * vy - uy * vx).expand(r[:, 0].shape)  # patches per unit of the plane z = 1
+    r, density = _patches(thin_intrinsics(intrinsics, step), h, w, margin)
     found = torch.stack(
         [
             _exchange(m.flatten(1), q.flatten(1), d.flatten(), hz)
@@ -153,6 +150,24 @@ def exchange_error(
     )
     inner = found.reshape(-1, 1, *around.shape[-2:])[..., margin : margin + h, margin : margin + w]
     return F.interpolate(inner, size=size, mode="bilinear", align_corners=False)
+
+
+def _patches(grid: Tensor, height: int, width: int, margin: int) -> tuple[Tensor, Tensor]:
+    """Rays (B, 3, H, W) of a grid with ``margin`` more pixels at each border, and pixels per unit of the plane z = 1 (B, H, W).
+
+    A lens is known inside its image only, and many fold outside: beyond the border it goes on as it is there, straight.
+    """
+    r = rays(grid, height, width)
+    x, y = r[:, :2].unbind(1)
+    ux, uy, vx, vy = (d.expand_as(x) for d in pixel_slopes(grid, x, y))
+    density = ux * vy - uy * vx
+    border = torch.stack([x, y, density, vy / density, -uy / density, -vx / density, ux / density], dim=1)
+    x, y, density, xu, xv, yu, yv = F.pad(border, (margin,) * 4, mode="replicate").unbind(1)
+    rows, columns = (torch.arange(-margin, n + margin, device=x.device) for n in (height, width))
+    beyond_v, beyond_u = rows - rows.clamp(0, height - 1), columns - columns.clamp(0, width - 1)
+    x = x + xu * beyond_u + xv * beyond_v[:, None]
+    y = y + yu * beyond_u + yv * beyond_v[:, None]
+    return torch.stack([x, y, torch.ones_like(x)], dim=1), density
 
 
 def _exchange(maps: Tensor, r: Tensor, density: Tensor, hz: float) -> Tensor:
@@ -164,7 +179,7 @@ def _exchange(maps: Tensor, r: Tensor, density: Tensor, hz: float) -> Tensor:
     k = 4 * math.pi * hz / SPEED_OF_LIGHT  # phase per metre of range, which is half a path
     distance = p.norm(dim=1)
     facing = (-(p * n).sum(1) / distance).clamp_min(_GRAZING)
-    # a pixel's solid angle is (z / d)^3 / (fx fy), where there is no lens
+    # a patch's solid angle is (z / d)^3 / density
     surface = z.pow(3) / distance / density / facing
     transfer = _transfer(p, n, surface, k)
     direct = torch.polar(facing / distance.square(), k * distance / 2)

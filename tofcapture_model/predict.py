@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -36,6 +36,9 @@ WARM, RUNS = (
 )  # runs before the timed ones, which allocate and wake threads; timed runs, whose median is told
 
 
+CAMERAS = 4  # whose tables and graphs are kept
+
+
 class _Watch(Protocol):
     """Do some work, wait for the device, and say how many milliseconds it took."""
 
@@ -55,8 +58,8 @@ class Predictor:
     Call it with
 
     - ``raw``: (K, H, W) taps of one frame, any real dtype, or a mean that :func:`tofcapture_model.raw_input.taken` took;
-    - ``info``: :class:`tofcapture.frames.TofInfo`, channels, saturation, light source, range errors; keep handing over the same one,
-      since another one has new decoding tables built, which takes as long as some frames;
+    - ``info``: :class:`tofcapture.frames.TofInfo`, channels, saturation, light source, range errors. What is prepared for a camera is
+      kept for the last four: decoding tables, which take as long as some frames, and on a GPU the recording;
     - ``camera``: calibrated intrinsics, ``None``: those of ``info``;
     - ``celsius``: sensor temperature, NaN: unknown.
 
@@ -84,7 +87,7 @@ class Predictor:
     def __init__(self, weights: Path | None = None, device: str = "cpu", backend: str = "torch") -> None:
         self._ask, self.network = _onnx_model(weights) if backend == "onnx" else _torch_model(weights, device)
         self._place = torch.device("cpu" if backend == "onnx" else device)
-        self._known: tuple[TofInfo, Camera, _Way] | None = None
+        self._ways: dict[Hashable, _Way] = {}
         if self._on_gpu:
             torch.cuda.set_device(self._place)  # streams, graphs and waiting are the current one's
 
@@ -122,10 +125,17 @@ class Predictor:
         )
 
     def _way(self, info: TofInfo, camera: Camera) -> _Way:
-        if self._known is None or self._known[0] is not info or self._known[1] != camera:
-            make = self._on_the_device if self._on_gpu else self._on_the_host
-            self._known = info, camera, make(info, camera)
-        return self._known[2]
+        key = (
+            camera, tuple(info.modulation_hz), tuple(info.phase_rad), tuple(map(float, info.illuminator)),
+            info.saturation, tuple(info.range_errors),
+        )  # fmt: skip
+        way = self._ways.pop(key, None)
+        if way is None:
+            if len(self._ways) == CAMERAS:  # before another one is made: a graph holds memory of its own
+                self._ways.pop(next(iter(self._ways)))
+            way = (self._on_the_device if self._on_gpu else self._on_the_host)(info, camera)
+        self._ways[key] = way  # the last one used stands last
+        return way
 
     def _on_the_host(self, info: TofInfo, camera: Camera) -> _Way:
         """Decode by the tables of numpy; what is asked is a frame."""

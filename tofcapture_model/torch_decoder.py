@@ -19,12 +19,13 @@ from tofcapture.camera import Camera
 from tofcapture.errors import DataError
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoder, ambiguity, frequencies
+from tofcapture.ops.phase.decoder import UNKNOWN_CELSIUS
 from tofcapture.ops.phase.float32 import Correction, tap_weights
 from tofcapture.rig import RangeError
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
-from tofcapture_model.intrinsics import intrinsics_of
+from tofcapture_model.intrinsics import expect_usable, intrinsics_of
 
-UNKNOWN_CELSIUS = 45.0
+_ROWS = 1 << 25  # elements of the table of distances that is held at once
 
 
 class Taps(NamedTuple):
@@ -85,6 +86,7 @@ class TorchDecoder:
 
     def __init__(self, info: TofInfo, camera: Camera, device: torch.device) -> None:
         Decoder(replace(info, camera=camera))  # refuses what cannot be decoded
+        expect_usable(camera)
         low, high = frequencies(info.modulation_hz)
         errors = {e.modulation_hz: e for e in info.range_errors}
         self._low, self._high = (_Range(errors.get(f, RangeError(f)), camera, device) for f in (low, high))
@@ -123,8 +125,10 @@ class TorchDecoder:
     def __call__(self, taps: Taps) -> Frame:
         """Decode one frame: a batch of one, without cues."""
         raw = taps.raw
-        celsius = torch.nan_to_num(taps.celsius, nan=UNKNOWN_CELSIUS)
-        phasor = torch.einsum("ck,khw->chw", self._demodulation, raw)
+        known = taps.celsius.isfinite()
+        celsius = torch.where(known, taps.celsius, torch.full_like(taps.celsius, UNKNOWN_CELSIUS))
+        # no matrix product: TF32, where somebody allows it, would round counts of 12 bits to 11
+        phasor = (self._demodulation[:, :, None, None] * raw).sum(1)
         amplitude = torch.stack([phasor[:2], phasor[2:]]).square().sum(1).sqrt()
         low = self._low(phasor[0], phasor[1], amplitude[0], celsius)
         high = self._high(phasor[2], phasor[3], amplitude[1], celsius)
@@ -133,15 +137,16 @@ class TorchDecoder:
         fused = low - gap * self._lean
         fused = fused - torch.floor(fused / self._unambiguous[0]) * self._unambiguous[0]
         depth = (fused.square() - self._quarter) / (fused * self._length - self._slant)
-        lit = (amplitude.amin(0) > 0) & (raw.amax(0) < self._saturation) & (fused > self._nearest)
-        valid = lit & (depth > MIN_RANGE) & (depth < MAX_RANGE)  # false where it is no number
+        lit = amplitude.amin(0) > 0
+        sure = lit & (raw.amax(0) < self._saturation) & (fused > self._nearest)
+        valid = sure & (depth > MIN_RANGE) & (depth < MAX_RANGE)  # false where it is no number
         frame = Frame(
             raw=raw / self._saturation,
             phasor=phasor / self._saturation,
             depth=fill_nearest(depth, valid)[None],
             valid=valid[None].to(raw),
             confidence=amplitude[1:] / self._saturation,
-            gap=torch.nan_to_num(gap, nan=0.0)[None],
+            gap=torch.where(lit, gap, torch.zeros_like(gap))[None],
             cues=raw[:0],
             modulation=self._modulation,
             intrinsics=self._intrinsics,
@@ -153,10 +158,11 @@ class TorchDecoder:
 def fill_nearest(image: Tensor, valid: Tensor) -> Tensor:
     """Give every pixel (H, W) outside ``valid`` the value of a nearest pixel inside; 1 where nothing is valid at all.
 
-    Distances are exact: first the nearest of each column, then the nearest of those along the row.
+    Distances are exact: first the nearest of each column, then the nearest of those along the row, some rows at a time.
     """
     h, w = image.shape
-    rows, columns = torch.arange(h, device=image.device)[:, None], torch.arange(w, device=image.device)
+    rows = torch.arange(h, dtype=torch.int32, device=image.device)[:, None]
+    columns = torch.arange(w, dtype=torch.int32, device=image.device)
     far = 2 * (h + w)
     above = torch.where(valid, rows, -far).cummax(0).values
     below = torch.where(valid, rows, far + h).flip(0).cummin(0).values.flip(0)

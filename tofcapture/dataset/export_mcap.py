@@ -103,7 +103,7 @@ def _calibration(camera: Camera) -> dict[str, Any]:
         "frame_id": "tof",
         **size,
         "distortion_model": "plumb_bob",
-        "D": [0.0] * 5,
+        "D": list(camera.distortion) or [0.0] * 5,  # both have k1, k2, p1, p2, k3
         "K": K,
         "R": R,
         "P": P,

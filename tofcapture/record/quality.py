@@ -237,9 +237,8 @@ def _overlap(stereo: StereoFrame, rig: Rig) -> float:
     step = max(1, stereo.points.shape[1] // _COLUMNS)
     points = stereo.points[::step, ::step].reshape(-1, 3).astype(np.float64)
     points = transform_points(rig.T_tof_stereo, points[np.isfinite(points).all(axis=1)])
-    points = points[points[:, 2] > 0]
-    u = camera.fx * points[:, 0] / points[:, 2] + camera.cx
-    v = camera.fy * points[:, 1] / points[:, 2] + camera.cy
+    pixels = camera.project(points)[0]
+    u, v = pixels[np.isfinite(pixels).all(axis=1)].T
     cells = (min(_CELLS[0], camera.height), min(_CELLS[1], camera.width))
     edges = ((-0.5, camera.height - 0.5), (-0.5, camera.width - 0.5))
     hit = np.histogram2d(v, u, bins=cells, range=edges)[0]

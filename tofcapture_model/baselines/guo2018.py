@@ -99,7 +99,7 @@ class MRM(Baseline):
             x = F.leaky_relu(conv(x), _SLOPE)
         c = self.channels
         x = self.head[-1](x)[:, : c * c, top : top + h, left : left + w]
-        mix = x.reshape(len(x), c, c, h, w).float()
+        mix = x.unflatten(1, (c, c)).float()  # an export must not know the batch
         return mix + torch.eye(c, device=x.device).reshape(1, c, c, 1, 1)  # type: ignore[no-any-return]
 
     def loss(self, estimate: Estimate, target: Target, frame: Frame) -> Tensor:

@@ -27,7 +27,7 @@ from tofcapture.rig import RangeError
 _BLOCK = 1 << 16  # pixels; temporaries stay in a core's caches, and calls stay long against their overhead
 _AMBIGUOUS = 0.25  # wraps of disagreement between the frequencies
 _UNCERTAIN = 0.020  # m, standard deviation from which a pixel is of low confidence
-_UNKNOWN_CELSIUS = 45.0
+UNKNOWN_CELSIUS = 45.0
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class Decoder:
         kept: Signals | None = None,
     ) -> DepthMaps:
         camera = self.info.camera
-        celsius = celsius if np.isfinite(celsius) else _UNKNOWN_CELSIUS
+        celsius = celsius if np.isfinite(celsius) else UNKNOWN_CELSIUS
         flat = np.ascontiguousarray(raw).reshape(len(raw), -1)
         n = flat.shape[1]
         out = out or _empty_maps(camera.shape)
