@@ -41,7 +41,7 @@ from tofcapture_model.intrinsics import (
     thin_intrinsics,
     with_lens,
 )
-from tofcapture_model.multipath import cues
+from tofcapture_model.multipath import _patches, cues
 from tofcapture_model.predict import Predictor, predict
 from tofcapture_model.raw_input import NOMINAL_CAMERA
 from tofcapture_model.torch_decoder import TorchDecoder
@@ -209,6 +209,29 @@ def test_expected_interreflection_does_not_depend_on_the_lens():
     # what is seen differs with the field of view; continued beyond the image, it is the same scene
     for of, limit in ((0, 0.08), (1, 0.03)):
         assert (maps[1] - there)[of][inside].abs().mean() / there[of][inside].mean() < limit
+
+
+def test_patches_have_the_size_that_the_lens_gives_them():
+    """Rays and areas of every tenth pixel are those of the camera's own rays; beyond the border both go on straight, as a pinhole's do everywhere."""
+    r, density = _patches(thin_intrinsics(numbers(LENS), 10), 9, 12, 3)
+    whole = torch.tensor(LENS.rays[..., :2])
+    along_u = (whole[5::10, 6::10] - whole[5::10, 4:-2:10]) * 5
+    along_v = (whole[6::10, 5::10] - whole[4:-2:10, 5::10]) * 5
+    area = along_u[..., 0] * along_v[..., 1] - along_u[..., 1] * along_v[..., 0]
+    inner = (slice(3, -3), slice(3, -3))
+    np.testing.assert_allclose(1 / density[0][inner], area, rtol=1e-3)
+    np.testing.assert_allclose(r[0, :2][:, *inner], whole[5::10, 5::10].permute(2, 0, 1), atol=1e-5)
+    for axis in (1, 2):  # second differences beyond the border and across it
+        bent = r[0, :2].diff(n=2, dim=axis).abs()
+        assert bent.narrow(axis, 0, 2).max() < 1e-5
+        assert bent.narrow(axis, bent.shape[axis] - 2, 2).max() < 1e-5
+    step = r[0, :2, 6, 2] - r[0, :2, 6, 3]  # one beyond, and the border itself
+    np.testing.assert_allclose(-step, along_u[3, 0], rtol=5e-3, atol=2e-4)
+    step = r[0, :2, 2, 6] - r[0, :2, 3, 6]
+    np.testing.assert_allclose(-step, along_v[0, 3], rtol=5e-3, atol=2e-4)
+    plain, _ = _patches(thin_intrinsics(numbers(PLAIN), 10), 9, 12, 3)
+    shifted = cut_intrinsics(thin_intrinsics(numbers(PLAIN), 10), -3, -3)
+    torch.testing.assert_close(plain, rays(shifted, 15, 18), atol=1e-6, rtol=0)
 
 
 def test_the_search_in_a_grid_is_exact_through_a_lens():
