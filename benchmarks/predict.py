@@ -23,10 +23,9 @@ from tofcapture_model.checkpoint import find_model, load_model, save_model
 from tofcapture_model.config import preset
 from tofcapture_model.data import batched, frame_decoder, make_frame
 from tofcapture_model.export import export
-from tofcapture_model.frame import Estimate, Frame, frame_to
-from tofcapture_model.joint import JointModel
+from tofcapture_model.frame import Frame, frame_to
 from tofcapture_model.onnx_backend import ask_onnx, open_onnx
-from tofcapture_model.predict import has_bfloat16, predict_raw, recorded
+from tofcapture_model.predict import Ask, has_bfloat16, predict_raw, recorded, torch_model
 from tofcapture_model.raw_input import NOMINAL_CAMERA, RawInput
 from tofcapture_model.zoo import build_model
 
@@ -42,12 +41,6 @@ def raw_frame() -> np.ndarray:
     return np.rint(600 + 300 * np.cos(phase) + rng.normal(0, 5, phase.shape)).astype(np.uint16)
 
 
-def in_half(model: JointModel, frame: Frame) -> Estimate:
-    """Answer as `predict` does with a network that was trained in bfloat16."""
-    with torch.autocast(frame.raw.device.type, torch.bfloat16, cache_enabled=frame.raw.device.type != "cuda"):
-        return model(frame)
-
-
 def seconds(call, device: str, repeats: int) -> float:
     """Median time of a call, after three that do not count."""
     times = []
@@ -60,16 +53,11 @@ def seconds(call, device: str, repeats: int) -> float:
     return float(np.median(times[3:]))
 
 
-def throughput(model: JointModel, frame: Frame, batch: int, device: str, repeats: int) -> str:
-    """Frames per second through the network, of a batch that lies on the device with its cues, and the share of peak."""
+def throughput(ask: Ask, frame: Frame, batch: int, device: str, repeats: int) -> str:
+    """Frames per second through the network as `predict` runs it, of a batch that lies on the device with its cues, and the share of peak."""
     kind = torch.device(device).type
-    model = model.to(device)
     many = frame_to(Frame(*(x.expand(batch, *x.shape[1:]).contiguous() for x in frame)), torch.device(device))
     half = has_bfloat16(kind)
-
-    def ask(frame: Frame) -> tuple:
-        return (in_half(model, frame) if half else model(frame))[:3]
-
     with FlopCounterMode(display=False) as counter:
         ask(many)
     launch = ask if kind == "cpu" else recorded(ask, many)
@@ -104,6 +92,7 @@ def main() -> None:
             config = preset(args.preset)
             weights = save_model(Path(folder) / "model.safetensors", build_model(config), config, {})
         model, _, _ = load_model(weights)
+        ask, _ = torch_model(weights, args.device)
         decoder = frame_decoder(info, NOMINAL_CAMERA)
         frame = batched(make_frame(raw, info, NOMINAL_CAMERA, decoder=decoder))
         if args.device != "cpu":
@@ -113,14 +102,14 @@ def main() -> None:
                 f"{args.device}: copy of the taps {found.decode_ms:.2f} ms, decoding, cues and network {found.inference_ms:.2f} ms"
             )
             with torch.inference_mode():
-                print(throughput(model, frame, args.batch, args.device, args.repeats))
+                print(throughput(ask, frame, args.batch, args.device, args.repeats))
             return
         calls = {
             "decode and cues": lambda: make_frame(raw, info, NOMINAL_CAMERA, decoder=decoder),
-            "network, torch": lambda: model(frame),
+            "network, float32": lambda: model(frame),
         }
         if has_bfloat16("cpu"):
-            calls["network, torch, bfloat16"] = lambda: in_half(model, frame)
+            calls["network as predict runs it"] = lambda: ask(frame)
         try:
             out = Path(folder) / "model.onnx"
             export(find_model(weights), out)
@@ -137,10 +126,10 @@ def main() -> None:
                     call()
                     wall[name].append(1000 * (time.perf_counter() - started))
                     cpu[name].append(1000 * (time.process_time() - used))
-            print(throughput(model, frame, args.batch, "cpu", 3))
+            print(throughput(ask, frame, args.batch, "cpu", 3))
     for name in calls:
         print(
-            f"{name:16} {np.median(wall[name][2:]):7.1f} ms (fastest {min(wall[name]):.1f}; cpu {np.median(cpu[name][2:]):.1f})"
+            f"{name:26} {np.median(wall[name][2:]):7.1f} ms (fastest {min(wall[name]):.1f}; cpu {np.median(cpu[name][2:]):.1f})"
         )
 
 

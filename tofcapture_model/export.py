@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -133,16 +134,18 @@ def _onnx(flat: nn.Module, path: Path, size: tuple[int, int], told: dict[str, st
     except ImportError as err:
         raise ConfigError(f"cannot export to ONNX: {err}", hint="pip install tofcapture[onnx]") from err
     names = [*Frame._fields, *OUTPUTS]
-    torch.onnx.export(
-        flat,
-        tuple(example(2, size)),
-        str(path),
-        input_names=list(Frame._fields),
-        output_names=list(OUTPUTS),
-        dynamic_axes={name: {0: "batch"} for name in names},
-        opset_version=OPSET,
-        dynamo=False,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what tracing may get wrong: the differences tell
+        torch.onnx.export(
+            flat,
+            tuple(example(2, size)),
+            str(path),
+            input_names=list(Frame._fields),
+            output_names=list(OUTPUTS),
+            dynamic_axes={name: {0: "batch"} for name in names},
+            opset_version=OPSET,
+            dynamo=False,
+        )
     made = onnx.load(str(path))
     onnx.helper.set_model_props(made, told)
     onnx.save(made, str(path))

@@ -13,6 +13,7 @@ from tofcapture.errors import ConfigError
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Config, loads_config
 from tofcapture_model.frame import Frame
+from tofcapture_model.intrinsics import LENS, with_lens
 
 OUTPUTS = ("depth_2x", "normals_2x", "error_2x")
 DIGEST, CONFIG = "weights_sha256", "config.toml"
@@ -63,8 +64,21 @@ def config_of(session: Any, path: Path, weights: Path) -> Config:
 
 
 def ask_onnx(session: Any, frame: Frame) -> list[NDArray[np.float32]]:
-    """Run an opened model on a frame; inputs that the export found unused are not asked for."""
-    wanted = {i.name for i in session.get_inputs()}
-    feed = {k: np.ascontiguousarray(v.numpy()) for k, v in frame._asdict().items() if k in wanted}
+    """Run an opened model on a frame; inputs that the export found unused are not asked for.
+
+    Raises
+    ------
+    ConfigError
+        The camera has a lens, and the export was made before they took one.
+    """
+    wanted = {i.name: i.shape for i in session.get_inputs()}
+    numbers = wanted.get("intrinsics", (0, LENS))[1]
+    if frame.intrinsics.shape[1] > numbers:
+        raise ConfigError(
+            "expected an export for cameras with lens distortion, got one that takes none",
+            hint="run tofcapture export again: it takes any lens now",
+        )
+    asked = frame._replace(intrinsics=with_lens(frame.intrinsics)[:, :numbers])
+    feed = {k: np.ascontiguousarray(v.numpy()) for k, v in asked._asdict().items() if k in wanted}
     found: list[NDArray[np.float32]] = session.run(list(OUTPUTS), feed)
     return found

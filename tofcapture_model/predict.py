@@ -22,7 +22,6 @@ from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.config import BASELINES
 from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
-from tofcapture_model.intrinsics import LENS, with_lens
 from tofcapture_model.joint import JointModel
 from tofcapture_model.prediction import Prediction, write_prediction
 from tofcapture_model.raw_input import RawInput, expect_finite, read_input, taken
@@ -85,7 +84,7 @@ class Predictor:
     """
 
     def __init__(self, weights: Path | None = None, device: str = "cpu", backend: str = "torch") -> None:
-        self._ask, self.network = _onnx_model(weights) if backend == "onnx" else _torch_model(weights, device)
+        self._ask, self.network = _onnx_model(weights) if backend == "onnx" else torch_model(weights, device)
         self._place = torch.device("cpu" if backend == "onnx" else device)
         self._ways: dict[Hashable, _Way] = {}
         if self._on_gpu:
@@ -265,8 +264,8 @@ def recorded(
     return replay
 
 
-def _torch_model(weights: Path | None, device: str) -> tuple[Ask, str]:
-    """Compute as it was trained: in bfloat16 if that is how it learned, and where the processor has it. With the network's kind."""
+def torch_model(weights: Path | None, device: str) -> tuple[Ask, str]:
+    """Load a network to compute as it was trained: in bfloat16 if that is how it learned, and where the device has it. With its kind."""
     model, config, _ = load_model(weights)
     model = model.to(device)
     kind = torch.device(device).type
@@ -312,7 +311,6 @@ def _onnx_model(weights: Path | None) -> tuple[Ask, str]:
     session = open_onnx(path)
     config = config_of(session, path, named if named != path else path.with_suffix(".safetensors"))
     size = tuple(session.get_inputs()[0].shape[-2:])
-    numbers = next((i.shape[1] for i in session.get_inputs() if i.name == "intrinsics"), LENS)
 
     def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         got = tuple(frame.depth.shape[-2:])
@@ -320,13 +318,7 @@ def _onnx_model(weights: Path | None) -> tuple[Ask, str]:
             raise ConfigError(
                 f"{path}: exported for frames of {size}, got {got}", hint="tofcapture export --size"
             )
-        if frame.intrinsics.shape[1] > numbers:
-            raise ConfigError(
-                f"{path}: exported for cameras without lens distortion, got one with",
-                hint="run tofcapture export again",
-            )
-        asked = frame._replace(intrinsics=with_lens(frame.intrinsics)[:, :numbers])
-        depth, normals, error = (torch.from_numpy(x) for x in ask_onnx(session, asked))
+        depth, normals, error = (torch.from_numpy(x) for x in ask_onnx(session, frame))
         return depth, normals, error
 
     return ask, config.network.kind
