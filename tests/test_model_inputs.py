@@ -96,7 +96,8 @@ def test_planes_are_fitted_to_the_mean_of_a_pixel_s_four():
     data, head = frame(batch=1), Raw2Normal(TINY_COMPACT, 1)
     depth = 0.8 + 0.01 * torch.rand(1, 1, 72, 88, generator=torch.Generator().manual_seed(0))
     swapped = F.pixel_shuffle(F.pixel_unshuffle(depth, 2)[:, [3, 2, 1, 0]], 2)
-    for one, other in zip(head._fitted(depth, data), head._fitted(swapped, data), strict=True):
+    r = rays(data.intrinsics, 36, 44)
+    for one, other in zip(head._fitted(depth, data, r), head._fitted(swapped, data, r), strict=True):
         torch.testing.assert_close(one, other)
 
 

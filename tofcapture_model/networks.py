@@ -49,11 +49,14 @@ class Features(NamedTuple):
         (B, K, H, W) classically denoised or corrected depths, metres; K may be 0.
     normals
         (B, 3, H, W) normals to start from; unit.
+    rays
+        (B, 3, H, W) of the sensor's pixels, z = 1; a lens takes some time to invert.
     """
 
     image: Tensor
     candidates: Tensor
     normals: Tensor
+    rays: Tensor
 
 
 class PaperInputs(nn.Module):
@@ -69,8 +72,8 @@ class PaperInputs(nn.Module):
         if "raw" in self.sources:
             expect_channels(frame.raw, SOURCES["raw"], "paper")
         image = torch.cat([getattr(frame, s) for s in self.sources], dim=1)
-        towards = -unit(rays(frame.intrinsics, *frame.depth.shape[-2:]))
-        return Features(image, frame.depth[:, :0], towards)
+        r = rays(frame.intrinsics, *frame.depth.shape[-2:])
+        return Features(image, frame.depth[:, :0], -unit(r), r)
 
 
 class CompactInputs(nn.Module):
@@ -103,7 +106,7 @@ class CompactInputs(nn.Module):
         ]
         corrected = frame.depth - frame.cues * self.cue_scale
         return Features(
-            torch.cat(channels, 1), torch.cat([*smooth, corrected], 1), normals[len(normals) // 2]
+            torch.cat(channels, 1), torch.cat([*smooth, corrected], 1), normals[len(normals) // 2], r
         )
 
 
@@ -208,7 +211,7 @@ class Raw2Normal(nn.Module):
         """Return unit camera-facing normals (B, 3, 2H, 2W) of a depth (B, 1, 2H, 2W)."""
         if not self.fits:
             return unit(doubled(features.normals) + F.pixel_shuffle(self.net(shared).float(), 2))
-        fitted = self._fitted(depth, frame)
+        fitted = self._fitted(depth, frame, features.rays)
         out = _planes(self.net(torch.cat([shared, features.normals, *fitted], dim=1)))
         # sub-pixels side by side until the end: interpolating and interleaving each term costs more than the convolutions
         parts = torch.unflatten(out, 1, (-1, 4))
@@ -217,12 +220,13 @@ class Raw2Normal(nn.Module):
             normals = torch.addcmul(normals, parts[:, k : k + 1], doubled_parts(n - features.normals))
         return F.pixel_shuffle(unit(normals).flatten(1, 2), 2)
 
-    def _fitted(self, depth: Tensor, frame: Frame) -> list[Tensor]:
+    def _fitted(self, depth: Tensor, frame: Frame, directions: Tensor) -> list[Tensor]:
         coarse = F.avg_pool2d(depth, 2)
         weight = frame.valid + _HOLE
-        k = frame.intrinsics
-        r = rays(k, *coarse.shape[-2:])
-        return [plane_normals(local_planes(coarse, weight, radius)[0], k, r) for radius in self.fits]
+        return [
+            plane_normals(local_planes(coarse, weight, radius)[0], frame.intrinsics, directions)
+            for radius in self.fits
+        ]
 
 
 def doubled(image: Tensor) -> Tensor:
