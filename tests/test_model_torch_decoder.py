@@ -13,6 +13,9 @@ from scipy.ndimage import distance_transform_edt
 
 torch = pytest.importorskip("torch")
 
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
 from tests.test_model_predict import table_top
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
@@ -112,13 +115,26 @@ def test_what_is_nearer_than_the_lamp_allows_is_no_depth():
     assert not found.valid[..., :30].any()
 
 
+class Largest(TorchDispatchMode):
+    """Elements of the largest tensor that any operation makes."""
+
+    most = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        found = function(*args, **(kwargs or {}))
+        self.most = max([self.most, *(x.numel() for x in tree_leaves(found) if isinstance(x, torch.Tensor))])
+        return found
+
+
 def test_some_rows_at_a_time_are_filled_alike(monkeypatch):
-    """Large images: the table of distances is made in parts."""
+    """Large images: the table of distances is made in parts, no larger than is held at once."""
     rng = np.random.default_rng(2)
     image, valid = torch.tensor(rng.random((31, 40))), torch.tensor(rng.random((31, 40)) < 0.02)
     whole = fill_nearest(image, valid)
-    monkeypatch.setattr(torch_decoder, "_ROWS", 40 * 40 * 4)
-    assert torch.equal(fill_nearest(image, valid), whole)
+    monkeypatch.setattr(torch_decoder, "_HELD", 40 * 40 * 4)
+    with Largest() as seen:
+        assert torch.equal(fill_nearest(image, valid), whole)
+    assert seen.most == 40 * 40 * 4
 
 
 def test_what_cannot_be_decoded_is_refused():

@@ -9,10 +9,8 @@ from torch import Tensor
 
 from tofcapture.errors import ConfigError
 
-MIN_RANGE, MAX_RANGE = (
-    0.05,
-    5.0,
-)  # m; a decoded depth beyond them is an unwrapping failure on this rig and counts as a hole
+# m; a decoded depth beyond them is an unwrapping failure on this rig and counts as a hole
+MIN_RANGE, MAX_RANGE = 0.05, 5.0
 
 
 class Frame(NamedTuple):

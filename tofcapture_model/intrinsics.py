@@ -15,9 +15,7 @@ from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError
 
 PINHOLE, LENS = 4, 9
-_NEWTON_STEPS = (
-    8  # four do for most lenses; what nearly folds at a corner would take many more, and is refused
-)
+_NEWTON_STEPS = 8  # four do for most lenses; one that nearly folds would take many more: refused
 _INVERTED = 1e-4  # of a ray's x and y at z = 1
 
 

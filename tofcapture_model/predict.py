@@ -29,12 +29,7 @@ from tofcapture_model.torch_decoder import Taps, TorchDecoder
 
 Float32 = NDArray[np.float32]
 T = TypeVar("T")
-WARM, RUNS = (
-    3,
-    7,
-)  # runs before the timed ones, which allocate and wake threads; timed runs, whose median is told
-
-
+WARM, RUNS = 3, 7  # runs before the timed ones, which allocate and wake threads; timed ones
 CAMERAS = 4  # whose tables and graphs are kept
 
 

@@ -25,7 +25,7 @@ from tofcapture.rig import RangeError
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
 from tofcapture_model.intrinsics import expect_usable, intrinsics_of
 
-_ROWS = 1 << 25  # elements of the table of distances that is held at once
+_HELD = 1 << 25  # elements of the table of distances
 
 
 class Taps(NamedTuple):
@@ -167,10 +167,10 @@ def fill_nearest(image: Tensor, valid: Tensor) -> Tensor:
     above = torch.where(valid, rows, -far).cummax(0).values
     below = torch.where(valid, rows, far + h).flip(0).cummin(0).values.flip(0)
     nearest = torch.where(rows - above <= below - rows, above, below)
-    apart = (rows - nearest).square()[:, None, :] + (
-        columns[:, None] - columns
-    ).square()  # row, pixel, column
-    column = apart.argmin(2)
+    up_and_down, sideways = (rows - nearest).square(), (columns[:, None] - columns).square()
+    # (row, pixel, column) of some rows at a time: all of a large image are gigabytes, which a graph would keep
+    some = up_and_down.split(max(1, _HELD // w**2))
+    column = torch.cat([(part[:, None, :] + sideways).argmin(2) for part in some])
     row = nearest.gather(1, column).clamp(0, h - 1)
     filled = image.flatten()[row * w + column]
     return torch.where(valid.any(), filled, torch.ones_like(filled))
