@@ -173,7 +173,7 @@ def test_without_numba_the_torch_search_gives_the_same_loss(monkeypatch):
 @pytest.mark.parametrize("count", [5, 256, 300, 2048, 4000])
 def test_sharing_out_leaves_loses_no_point(count):
     """The same points with the same pixels, before as after; across steps the boxes of the leaves are far shorter along the rays."""
-    from tofcapture_model.kernels.boxes import FAN, tidy
+    from tofcapture_model.kernels.leaves import FAN, tidy
 
     rng = np.random.default_rng(count)
     near = rng.random(count) < 0.5

@@ -169,7 +169,7 @@ def fill_nearest(image: Tensor, valid: Tensor) -> Tensor:
     nearest = torch.where(rows - above <= below - rows, above, below)
     up_and_down, sideways = (rows - nearest).square(), (columns[:, None] - columns).square()
     # (row, pixel, column) of some rows at a time: all of a large image are gigabytes, which a graph would keep
-    some = up_and_down.split(max(1, _HELD // w**2))
+    some = torch.split(up_and_down, max(1, _HELD // w**2))
     column = torch.cat([(part[:, None, :] + sideways).argmin(2) for part in some])
     row = nearest.gather(1, column).clamp(0, h - 1)
     filled = image.flatten()[row * w + column]

@@ -40,7 +40,7 @@ def usable(device: torch.device) -> bool:
 
 @dataclass(frozen=True)
 class Tree:
-    """A cloud as :mod:`tofcapture_model.kernels.boxes` has it.
+    """A cloud as :mod:`tofcapture_model.kernels.leaves` builds it.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Tree:
 
 def plant(cloud: Tensor, mask: Tensor) -> Tree:
     """Build the tree of the masked points of a cloud (3, H, W), metres; mask (H, W) is not empty."""
-    from tofcapture_model.kernels.boxes import FAN, fill, tidy, wrap
+    from tofcapture_model.kernels.leaves import FAN, fill, tidy, wrap
 
     points, there = np.ascontiguousarray(cloud.float().numpy()), np.ascontiguousarray(mask.numpy())
     n = int(np.count_nonzero(there))
