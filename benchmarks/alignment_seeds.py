@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.averaged_icp import average_transforms
-from calibration.backends import register_open3d
-from calibration.clouds import WORKING_DEPTH, Cloud, tof_depth
-from calibration.evidence import alignment_error
-from calibration.fusion import about, fuse, twist_about
-from calibration.joint_icp import joint_icp
-from calibration.joint_views import joint_view_of
+from calibration.alignment.averaged_icp import average_transforms
+from calibration.alignment.fusion import about, fuse, twist_about
+from calibration.alignment.joint_icp import joint_icp
+from calibration.alignment.joint_views import joint_view_of
+from calibration.evidence.evidence import alignment_error
+from calibration.registration.backends import register_open3d
+from calibration.registration.clouds import WORKING_DEPTH, Cloud, tof_depth
 from tofcapture.devices.sim import stereo as stereos
 from tofcapture.devices.sim.light import Light
 from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects

@@ -19,10 +19,10 @@ import torch
 
 from tofcapture.devices.sim.world import factory_calibration, read_constants
 from tofcapture.rig import RangeError
-from tofcapture_model.baselines import sensor
-from tofcapture_model.checkpoint import load_model
-from tofcapture_model.data import FrameDataset, batched, frame_decoder, make_frame
-from tofcapture_model.joint import JointModel
+from tofcapture_model.data.frames import FrameDataset, batched, frame_decoder, make_frame
+from tofcapture_model.networks.baselines import sensor
+from tofcapture_model.networks.joint import JointModel
+from tofcapture_model.training.checkpoint import load_model
 
 SEED = 900_000  # far from those of any data
 

@@ -17,8 +17,8 @@ import time
 import numpy as np
 import torch
 
-from tofcapture_model.chamfer import candidate_shifts, robust_chamfer
-from tofcapture_model.geometry import unproject
+from tofcapture_model.geometry.maps import unproject
+from tofcapture_model.losses.chamfer.robust import candidate_shifts, robust_chamfer
 
 K = torch.tensor([[381.2, 401.5, 234.2, 203.5]])
 SHAPE = (360, 480)

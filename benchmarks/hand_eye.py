@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.hand_eye import solve_hand_eye
-from calibration.hand_eye_closed import invert_all
+from calibration.hand_eye.closed_form import invert_all
+from calibration.hand_eye.solve import solve_hand_eye
 from tofcapture.poses import exp, invert, look_at, rotation_angle, rotation_exp, rotation_log, transform
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "realdata"

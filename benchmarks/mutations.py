@@ -36,7 +36,7 @@ from tofcapture.files.shard_writer import ShardWriter
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.poses import exp
 from tofcapture.rig import Rig
-from tofcapture_model.shards import ShardDataset
+from tofcapture_model.data.shards import ShardDataset
 
 TOF, STEREO = Camera(16, 12, 12.7, 13.4, 7.8, 6.8), Camera(32, 24, 30.0, 30.0, 15.5, 11.5)
 RIG = Rig(TOF, STEREO, exp([-0.05, 0.07, 0, 0, 0.01, 0]), np.eye(4))

@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.range_fit import RangeFit, fit_ranges
-from calibration.range_views import Seen, seen_of
+from calibration.range_error.fit import RangeFit, fit_ranges
+from calibration.range_error.views import Seen, seen_of
 from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects
 from tofcapture.devices.sim.world import Constants, SimWorld, read_constants
 from tofcapture.errors import QualityError, TofError

@@ -31,7 +31,7 @@ from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.ops.normals import normals_from_depth
 from tofcapture.ops.phase import ambiguity, frequencies, radial_to_range, taps
 from tofcapture.rig import Rig
-from tofcapture_model.shards import ShardDataset
+from tofcapture_model.data.shards import ShardDataset
 
 TOF = Camera(240, 180, 190.6, 200.8, 116.8, 101.5)
 STEREO = Camera(1280, 1024, 1400.0, 1400.0, 639.5, 511.5)

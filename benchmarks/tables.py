@@ -18,11 +18,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from tofcapture_model.config import BASELINES, OURS, Config, Training, preset
-from tofcapture_model.progress import Report, progress
+from tofcapture_model.training.progress import Report, progress
 
 
 def recipes() -> dict[str, dict[str, Config]]:
-    """Configurations by suite and by the name of the run; :data:`tofcapture_model.tables.SUITES` has the tables' words for them."""
+    """Configurations by suite and by the name of the run; :data:`tofcapture_model.evaluation.tables.SUITES` has the tables' words for them."""
     paper = preset("paper")
     network, losses = paper.network, paper.losses
     one_pass = tuple(stage for stage in paper.stages if stage.name != "refine")
@@ -112,7 +112,7 @@ def _titled(run: str, report: Report) -> Callable[[str, float, str], None]:
 
 def _train_all(args: argparse.Namespace, wanted: Mapping[str, Config]) -> dict[str, list[Path]]:
     """Train what is missing; folders of runs by name."""
-    from tofcapture_model.train import train
+    from tofcapture_model.training.train import train
 
     runs: dict[str, list[Path]] = {}
     for name, seed in [(name, seed) for name in wanted for seed in range(args.seeds)]:
@@ -138,7 +138,7 @@ def main() -> None:
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")  # before torch: idle threads soon sleep
     import torch
 
-    from tofcapture_model.suite import FREE, measure_runs, read_weights, write_suite
+    from tofcapture_model.evaluation.suite import FREE, measure_runs, read_weights, write_suite
 
     if args.threads:
         torch.set_num_threads(args.threads)

@@ -44,7 +44,7 @@ def pages(demo: Path) -> None:
     """Photograph Rerun, the report and the site's home."""
     from playwright.sync_api import sync_playwright
 
-    from tofcapture.viewer.web import make_server
+    from tofcapture.viz.web import make_server
 
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
         rrd = Path(folder) / "view.rrd"

@@ -10,7 +10,7 @@ from pathlib import Path
 from tofcapture.cli import main as tofcapture
 from tofcapture.devices.station import DEFAULT
 from tofcapture_model.config import preset
-from tofcapture_model.train import train
+from tofcapture_model.training.train import train
 
 SENSOR = """
 [sim.tof]

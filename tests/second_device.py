@@ -93,11 +93,11 @@ def main(dataset: Path, out: Path) -> None:
     _setup_privateuseone_for_python_backend(NAME)
     torch.autocast = lambda *_, **__: nullcontext()
 
-    from tofcapture_model import learner
     from tofcapture_model.config import Stage, preset
-    from tofcapture_model.evaluate import evaluate
-    from tofcapture_model.suite import run_suite
-    from tofcapture_model.train import train
+    from tofcapture_model.evaluation.evaluate import evaluate
+    from tofcapture_model.evaluation.suite import run_suite
+    from tofcapture_model.training import learner
+    from tofcapture_model.training.train import train
 
     learner.Learner._generator = lambda _self, _position: torch.Generator().manual_seed(0)
     demo = preset("demo")

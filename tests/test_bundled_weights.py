@@ -14,10 +14,10 @@ torch = pytest.importorskip("torch")
 from tests.bundled_answer import KEPT, answer
 from tofcapture.cli import main
 from tofcapture.files.manifest import load_manifest
-from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.config import loads_config, preset
-from tofcapture_model.export import example
-from tofcapture_model.suite import run_suite
+from tofcapture_model.evaluation.suite import run_suite
+from tofcapture_model.inference.export import example
+from tofcapture_model.training.checkpoint import find_model, load_model
 
 CARD = files("tofcapture_model") / "weights" / "MODEL_CARD.md"
 LARGEST = 16 * 2**20  # bytes

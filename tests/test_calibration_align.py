@@ -9,14 +9,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.cli import ALIGN
-from calibration.clouds import Cloud, grid_normals, plane_departure, stereo_cloud, surface_points, tof_depth
-from calibration.evidence import alignment_error
-from calibration.pairs import pair_of
-from calibration.range_residual import RangeResidual, fit_range_residual, no_residual
-from calibration.registration import Refusal, check_registration, measure_registration, residuals
-from calibration.rims import rim_cloud, stereo_rims, tof_rims
-from calibration.solve import _common_rig, align
+from calibration.align import _common_rig, align
+from calibration.alignment.range_residual import RangeResidual, fit_range_residual, no_residual
+from calibration.board.rims import rim_cloud, stereo_rims, tof_rims
+from calibration.cli.align import ALIGN
+from calibration.evidence.evidence import alignment_error
+from calibration.registration.clouds import (
+    Cloud,
+    grid_normals,
+    plane_departure,
+    stereo_cloud,
+    surface_points,
+    tof_depth,
+)
+from calibration.registration.gate import Refusal, check_registration, measure_registration, residuals
+from calibration.registration.pairs import pair_of
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, QualityError
@@ -328,7 +335,7 @@ def test_align_command_reports_as_text_and_json(recording, monkeypatch):
     """The command's text is a table with a verdict; its data is JSON and holds spread, error and paths."""
     evidence = json.loads((recording / "evidence.json").read_text())
     rig = load_rig(recording / "rig.toml")
-    monkeypatch.setattr("calibration.solve.align", lambda *_: (rig, evidence))
+    monkeypatch.setattr("calibration.align.align", lambda *_: (rig, evidence))
     parser = argparse.ArgumentParser()
     ALIGN.configure(parser)
     outcome = ALIGN.run(parser.parse_args([str(recording)]))

@@ -7,7 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.averaged_icp import average_transforms, mean_rotation, median_point, median_rotation
+from calibration.alignment.averaged_icp import (
+    average_transforms,
+    mean_rotation,
+    median_point,
+    median_rotation,
+)
 from tofcapture import poses
 from tofcapture.errors import DataError
 

@@ -9,8 +9,8 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from calibration.align_diagnosis import check_start, unusable
-from calibration.solve import align
+from calibration.align import align
+from calibration.alignment.diagnosis import check_start, unusable
 from tests.stations import HALF_SIZE_CAMERAS
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, QualityError

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.board import Board, board_from, distance_to_ring, inside, load_board, symmetries
-from calibration.board_detector import detect
-from calibration.board_drawing import dxf, stl, svg
-from calibration.board_fit import Sight
-from calibration.board_model import Model, on_front
-from calibration.calibrate_cli import COMMAND
-from calibration.coverage import coverage, meter
+from calibration.board.coverage import coverage, meter
+from calibration.board.detector import detect
+from calibration.board.drawing import dxf, stl, svg
+from calibration.board.fit import Sight
+from calibration.board.geometry import Board, board_from, distance_to_ring, inside, load_board, symmetries
+from calibration.board.model import Model, on_front
+from calibration.cli.calibrate import COMMAND
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.shapes.made import BOARD_SIZE
 from tofcapture.devices.sim.shapes.made import board as simulated_board

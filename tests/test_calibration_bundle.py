@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.bundle import ARM_SIGMA, BoardFit, solve_bundle
-from calibration.bundle_cli import consistency
-from calibration.bundle_equations import Observations
-from calibration.hand_eye_refusal import Cause, HandEyeRefused
+from calibration.bundle.equations import Observations
+from calibration.bundle.solve import ARM_SIGMA, BoardFit, solve_bundle
+from calibration.cli.bundle import consistency
+from calibration.hand_eye.refusal import Cause, HandEyeRefused
 from tofcapture import poses
 from tofcapture.errors import DataError, QualityError
 

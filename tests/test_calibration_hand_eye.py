@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.hand_eye import refine_from_consensus, solve_hand_eye, to_dict
-from calibration.hand_eye_closed import daniilidis, invert_all, park_martin, residuals, shah
-from calibration.hand_eye_files import read_csv, read_pairs
-from calibration.hand_eye_refine import jacobian
-from calibration.hand_eye_refusal import Cause, HandEyeRefused
-from calibration.time_offset import coarse_offset, make_stream, pairs_at, refine_offset
+from calibration.hand_eye.closed_form import daniilidis, invert_all, park_martin, residuals, shah
+from calibration.hand_eye.files import read_csv, read_pairs
+from calibration.hand_eye.refine import jacobian
+from calibration.hand_eye.refusal import Cause, HandEyeRefused
+from calibration.hand_eye.solve import refine_from_consensus, solve_hand_eye, to_dict
+from calibration.hand_eye.time_offset import coarse_offset, make_stream, pairs_at, refine_offset
 from tests.hand_eye import apart, station, streams
 from tofcapture.errors import DataError
 from tofcapture.poses import exp, invert, rotation_exp, rotation_log, transform

@@ -8,8 +8,8 @@ import json
 import numpy as np
 import pytest
 
-from calibration import calibrate_cli
-from calibration.hand_eye_files import read_csv, read_pairs
+from calibration.cli import calibrate as calibrate_cli
+from calibration.hand_eye.files import read_csv, read_pairs
 from tests.hand_eye import apart, station, streams
 from tofcapture.errors import DataError, FormatError, UsageError
 from tofcapture.poses import invert

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration import calibrate_cli
-from calibration.hand_eye_files import read_pairs_said, read_poses
-from calibration.hand_eye_forms import readings_of
+from calibration.cli import calibrate as calibrate_cli
+from calibration.hand_eye.files import read_pairs_said, read_poses
+from calibration.hand_eye.forms import readings_of
 from tests.test_calibration_hand_eye import station
 from tofcapture.errors import DataError, FormatError
 

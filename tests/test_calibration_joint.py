@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.clouds import Cloud
-from calibration.fusion import about, fuse, jackknife, twist_about
-from calibration.joint_icp import joint_icp
-from calibration.joint_rims import _continued, _shares, square_rims
-from calibration.joint_views import HALO_RADII, JointView, halo_errors
-from calibration.methods import joint_evidence, method_named
-from calibration.observability import motion_name, observability, plane_information, suggest_view
-from calibration.range_error import TERMS, composed
-from calibration.rims import Rims
+from calibration.alignment.fusion import about, fuse, jackknife, twist_about
+from calibration.alignment.joint_icp import joint_icp
+from calibration.alignment.joint_rims import _continued, _shares, square_rims
+from calibration.alignment.joint_views import HALO_RADII, JointView, halo_errors
+from calibration.alignment.methods import joint_evidence, method_named
+from calibration.alignment.observability import motion_name, observability, plane_information, suggest_view
+from calibration.board.rims import Rims
+from calibration.range_error.error import TERMS, composed
+from calibration.registration.clouds import Cloud
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, QualityError

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration import lens_cli
-from calibration.board import load_board
-from calibration.board_model import Model, clear_of_walls
-from calibration.lens_board import BoardSeen, fit_lens_to_board
-from calibration.lens_cli import report, table
+from calibration.board.geometry import load_board
+from calibration.board.model import Model, clear_of_walls
+from calibration.cli import lens as lens_cli
+from calibration.cli.lens import report, table
+from calibration.lens.board import BoardSeen, fit_lens_to_board
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.cli import main
@@ -101,7 +101,9 @@ def test_views_that_a_wrong_lens_hid_are_looked_at_again(tmp_path, monkeypatch, 
             raise QualityError("board: wrong board")
         return views[name]
 
-    monkeypatch.setattr("calibration.pairs.calibration_views", lambda _: [Path(name) for name in views])
+    monkeypatch.setattr(
+        "calibration.registration.pairs.calibration_views", lambda _: [Path(name) for name in views]
+    )
     monkeypatch.setattr("tofcapture.files.view.read_view", lambda path: path)
     monkeypatch.setattr(lens_cli, "board_seen", look)
     assert main(["calibrate", "lens", str(tmp_path), "--json"]) == 0

@@ -9,15 +9,15 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from calibration.board import load_board
-from calibration.board_detector import BoardRefusal, detect, stereo_sight, tof_sight
-from calibration.cli import _page
-from calibration.compare import OldRig, drift, drift_text, load_old, uncertainty
-from calibration.limits import LIMITS
-from calibration.page import charts, read_evidence, write_page
-from calibration.page.checks import check, image_medians, least_certain, worst
-from calibration.page.content import page_content
-from calibration.page.samples import Samples, sample_recording
+from calibration.board.detector import BoardRefusal, detect, stereo_sight, tof_sight
+from calibration.board.geometry import load_board
+from calibration.cli.align import _page
+from calibration.evidence.compare import OldRig, drift, drift_text, load_old, uncertainty
+from calibration.evidence.limits import LIMITS
+from calibration.evidence.page import charts, read_evidence, write_page
+from calibration.evidence.page.checks import check, image_medians, least_certain, worst
+from calibration.evidence.page.content import page_content
+from calibration.evidence.page.samples import Samples, sample_recording
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects
 from tofcapture.devices.sim.world import SimWorld, read_constants
@@ -260,7 +260,7 @@ def test_align_goes_on_without_the_page(tmp_path, monkeypatch):
     def missing():
         raise ConfigError("jinja2 is needed", hint="pip install")
 
-    monkeypatch.setattr("calibration.page._template", missing)
+    monkeypatch.setattr("calibration.evidence.page._template", missing)
     (tmp_path / "evidence.html").write_text("old")
     path, reason = _page(tmp_path, None, evidence(), lambda *_: None)
     assert path is None

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from calibration import calibrate_cli
-from calibration.phase_order import PhaseOrderRefused, find_phase_order
+from calibration.cli import calibrate as calibrate_cli
+from calibration.phase_order.find import PhaseOrderRefused, find_phase_order
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError, FormatError
 from tofcapture.ops.phase import mean_phasors, taps

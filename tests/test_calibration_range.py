@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration import calibrate_cli
-from calibration.range_fit import fit_ranges
-from calibration.range_surface import surface_at_pixels
-from calibration.range_views import seen_of
+from calibration.cli import calibrate as calibrate_cli
+from calibration.range_error.fit import fit_ranges
+from calibration.range_error.surface import surface_at_pixels
+from calibration.range_error.views import seen_of
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.light import Light

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.phase_order import find_phase_order
-from calibration.raw_files import read_raw, signed, without_metadata
+from calibration.phase_order.find import find_phase_order
+from calibration.phase_order.raw_files import read_raw, signed, without_metadata
 from tests.test_calibration_phase_order import SHAPE, made, same
 from tofcapture.errors import DataError, FormatError
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.backends import BACKENDS, backend_named, register
-from calibration.clouds import Cloud
-from calibration.registration import Refusal, check_registration, measure_registration
+from calibration.registration.backends import BACKENDS, backend_named, register
+from calibration.registration.clouds import Cloud
+from calibration.registration.gate import Refusal, check_registration, measure_registration
 from tofcapture import poses
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.o3d import load_open3d

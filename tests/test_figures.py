@@ -19,11 +19,11 @@ from tofcapture.files.maps import GroundTruth
 from tofcapture.files.view import view_path, write_view
 from tofcapture.poses import look_at
 from tofcapture.rig import dumps_rig
-from tofcapture.viewer import figures
-from tofcapture.viewer.figures_clouds import splat, stage_for
-from tofcapture.viewer.figures_preprocessing import gap, preprocess
-from tofcapture.viewer.figures_rows import Maps, object_window, read_rows
-from tofcapture.viewer.figures_table import Scale, percentile, round_up
+from tofcapture.viz.figures import write as figures
+from tofcapture.viz.figures.clouds import splat, stage_for
+from tofcapture.viz.figures.preprocessing import gap, preprocess
+from tofcapture.viz.figures.rows import Maps, object_window, read_rows
+from tofcapture.viz.figures.table import Scale, percentile, round_up
 
 pytest.importorskip("matplotlib")
 

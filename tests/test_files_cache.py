@@ -19,7 +19,7 @@ from tofcapture.files import cache as packing
 from tofcapture.files.cache import open_cache, pack, verify_cache
 from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
 from tofcapture.files.shard import ShardReader
-from tofcapture_model.shards import ShardDataset
+from tofcapture_model.data.shards import ShardDataset
 
 
 def make(folder, scenes=("box", "mug"), split="train"):

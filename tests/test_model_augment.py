@@ -16,7 +16,7 @@ from tofcapture.frames import TofInfo
 from tofcapture.ops.normals import normals_from_depth
 from tofcapture.ops.phase import Decoder, TapNoise, ambiguity, frequencies, phasors, radial_to_range, taps
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError
-from tofcapture_model.augment import (
+from tofcapture_model.data.augment import (
     BurstNoise,
     RawItem,
     crop,
@@ -26,7 +26,7 @@ from tofcapture_model.augment import (
     redraw_noise,
     scale_albedo,
 )
-from tofcapture_model.data import batched, frame_decoder, make_frame
+from tofcapture_model.data.frames import batched, frame_decoder, make_frame
 
 CAMERA = Camera(24, 18, 20.0, 21.0, 11.2, 9.1)
 LIGHT = np.array([0.03, 0.01, 0.0])

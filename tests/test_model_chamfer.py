@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 
 torch = pytest.importorskip("torch")
 
-from tofcapture_model.chamfer import candidate_shifts, robust_chamfer
-from tofcapture_model.geometry import unproject
-from tofcapture_model.neighbours import nearest
+from tofcapture_model.geometry.maps import unproject
+from tofcapture_model.losses.chamfer.neighbours import nearest
+from tofcapture_model.losses.chamfer.robust import candidate_shifts, robust_chamfer
 
 K = torch.tensor([[60.0, 60.0, 23.5, 17.5]])
 SHAPE = (36, 48)

@@ -8,8 +8,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from tofcapture_model.chamfer import candidate_shifts, robust_chamfer
-from tofcapture_model.geometry import depth_to_normals, unproject
+from tofcapture_model.geometry.maps import depth_to_normals, unproject
+from tofcapture_model.losses.chamfer.robust import candidate_shifts, robust_chamfer
 
 SHAPE = (18, 24)
 K = torch.tensor([[60.0, 60.0, 11.5, 8.5]])

@@ -12,8 +12,9 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("triton", reason="Triton comes with PyTorch's wheels for GPUs")
 
-from tofcapture_model import chamfer, neighbours, tile_search
-from tofcapture_model.geometry import unproject
+from tofcapture_model.geometry.maps import unproject
+from tofcapture_model.losses.chamfer import neighbours, tile_search
+from tofcapture_model.losses.chamfer import robust as chamfer
 
 CAMERA = torch.tensor([[25.0, 26.0, 10.0, 6.0]])
 SHAPE = (13, 21)  # no multiple of a tile's side
@@ -103,7 +104,7 @@ def test_the_kernel_compiles_for_a_gpu(with_codes, monkeypatch, tmp_path):
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
-    from tofcapture_model.kernels import nearest_tiles as kernel
+    from tofcapture_model.losses.chamfer import nearest_tiles as kernel
 
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
     monkeypatch.setenv("TRITON_DEFAULT_FP_FUSION", "1")  # what it does unset, with a warning

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 torch = pytest.importorskip("torch")
 pytest.importorskip("numba")
 
-from tofcapture_model import chamfer, neighbours, trees
-from tofcapture_model.geometry import unproject
+from tofcapture_model.geometry.maps import unproject
+from tofcapture_model.losses.chamfer import neighbours, trees
+from tofcapture_model.losses.chamfer import robust as chamfer
 
 SHIFTS = chamfer.candidate_shifts()
 MASKS = ("full", "sparse", "holes", "one pixel", "corner")
@@ -173,7 +174,7 @@ def test_without_numba_the_torch_search_gives_the_same_loss(monkeypatch):
 @pytest.mark.parametrize("count", [5, 256, 300, 2048, 4000])
 def test_sharing_out_leaves_loses_no_point(count):
     """The same points with the same pixels, before as after; across steps the boxes of the leaves are far shorter along the rays."""
-    from tofcapture_model.kernels.leaves import FAN, tidy
+    from tofcapture_model.losses.chamfer.leaves import FAN, tidy
 
     rng = np.random.default_rng(count)
     near = rng.random(count) < 0.5
@@ -194,7 +195,7 @@ def test_sharing_out_leaves_loses_no_point(count):
 
 def test_bounds_of_other_shifts_are_below_their_truth_and_rise_to_it():
     """No square changes by more than the clouds are moved: from any answer to any other shift."""
-    from tofcapture_model.kernels.boxes import bound
+    from tofcapture_model.losses.chamfer.boxes import bound
 
     rng = np.random.default_rng(4)
     camera = torch.tensor([[40.0, 43.0, 30.0, 20.0]])

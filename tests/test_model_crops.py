@@ -10,10 +10,10 @@ torch = pytest.importorskip("torch")
 
 from tests.test_model_baselines import target
 from tests.test_model_networks import frame
-from tofcapture_model.data import FrameDataset, crop, mirror
-from tofcapture_model.frame import Frame, Target
-from tofcapture_model.geometry import unproject
-from tofcapture_model.intrinsics import scale_intrinsics
+from tofcapture_model.data.frame import Frame, Target
+from tofcapture_model.data.frames import FrameDataset, crop, mirror
+from tofcapture_model.geometry.intrinsics import scale_intrinsics
+from tofcapture_model.geometry.maps import unproject
 
 H, W = 36, 44
 

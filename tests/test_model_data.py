@@ -18,9 +18,8 @@ from tests.analytic import make_dataset
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.seal import sha256_of
-from tofcapture_model import data as module
-from tofcapture_model.checkpoint import load_model
-from tofcapture_model.data import (
+from tofcapture_model.data import frames as module
+from tofcapture_model.data.frames import (
     FrameDataset,
     SampleId,
     collate,
@@ -29,9 +28,10 @@ from tofcapture_model.data import (
     mirror,
     spare_memory,
 )
-from tofcapture_model.geometry import depth_to_normals
-from tofcapture_model.intrinsics import scale_intrinsics
-from tofcapture_model.raw_input import NOMINAL_CAMERA
+from tofcapture_model.data.raw_input import NOMINAL_CAMERA
+from tofcapture_model.geometry.intrinsics import scale_intrinsics
+from tofcapture_model.geometry.maps import depth_to_normals
+from tofcapture_model.training.checkpoint import load_model
 
 
 @pytest.fixture(scope="module")

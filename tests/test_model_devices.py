@@ -18,9 +18,9 @@ torch = pytest.importorskip("torch")
 from tests.analytic import make_dataset
 from tofcapture.errors import ConfigError
 from tofcapture_model.config import Stage, preset
-from tofcapture_model.evaluate import evaluate
-from tofcapture_model.learner import Group, processes
-from tofcapture_model.train import train
+from tofcapture_model.evaluation.evaluate import evaluate
+from tofcapture_model.training.learner import Group, processes
+from tofcapture_model.training.train import train
 
 ROOT = Path(__file__).parents[1]
 
@@ -107,8 +107,8 @@ def test_machines_that_share_no_folder_go_on_together(dataset, tmp_path):
     """Two processes with folders of their own, stopped and started again: the same step, the same weights as without a stop."""
     (tmp_path / "go.py").write_text(
         "import sys, json; from pathlib import Path; from dataclasses import replace\n"
-        "from tofcapture_model.config import preset, Stage; from tofcapture_model.train import train\n"
-        "import tofcapture_model.train as t\n"
+        "from tofcapture_model.config import preset, Stage; from tofcapture_model.training.train import train\n"
+        "import tofcapture_model.training.train as t\n"
         "c = preset('demo'); c = replace(c, network=replace(c.network, width=2, levels=2), stages=(Stage('joint', 2),),"
         " training=replace(c.training, batch=1, crop=(32, 32)))\n"
         "stop = int(sys.argv[3]) or None\n"
@@ -151,7 +151,7 @@ def test_machines_that_share_no_folder_go_on_together(dataset, tmp_path):
     assert first == second
     assert first[1]
     assert both("whole", 0)[0] == first
-    from tofcapture_model.checkpoint import load_model
+    from tofcapture_model.training.checkpoint import load_model
 
     models = [load_model(tmp_path / f"{name}0")[0].state_dict() for name in ("stopped", "whole")]
     assert all(torch.equal(a, b) for a, b in zip(*(m.values() for m in models), strict=True))

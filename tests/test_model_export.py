@@ -17,13 +17,13 @@ from tests.test_model_predict_inputs import SMALL, burst_of, rig, save_network  
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError
 from tofcapture.files.seal import sha256_of
-from tofcapture_model import checkpoint
-from tofcapture_model import export as exporting
-from tofcapture_model import predict as predicting
-from tofcapture_model.checkpoint import load_model, save_model
 from tofcapture_model.config import dumps_config, preset
-from tofcapture_model.export import export
-from tofcapture_model.predict import predict
+from tofcapture_model.inference import export as exporting
+from tofcapture_model.inference import predict as predicting
+from tofcapture_model.inference.export import export
+from tofcapture_model.inference.predict import predict
+from tofcapture_model.training import checkpoint
+from tofcapture_model.training.checkpoint import load_model, save_model
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 SIZE = SMALL.shape

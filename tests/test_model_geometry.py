@@ -12,7 +12,9 @@ torch = pytest.importorskip("torch")
 from torch import nn
 
 from tofcapture.camera import Camera
-from tofcapture_model.geometry import (
+from tofcapture_model.evaluation.metrics import angles_deg
+from tofcapture_model.geometry.intrinsics import rays, scale_intrinsics
+from tofcapture_model.geometry.maps import (
     depth_to_normals,
     local_planes,
     propagate_depth,
@@ -21,9 +23,7 @@ from tofcapture_model.geometry import (
     unit,
     unproject,
 )
-from tofcapture_model.intrinsics import rays, scale_intrinsics
-from tofcapture_model.metrics import angles_deg
-from tofcapture_model.refine import Refinement
+from tofcapture_model.networks.refine import Refinement
 
 CAMERA = Camera(60, 48, 190.6, 200.8, 29.2, 22.7)
 

@@ -14,12 +14,18 @@ from tests.test_model_geometry import CAMERA, plane
 from tests.test_model_multipath import HZ, SHAPE, K, corner
 from tests.test_model_networks import TINY_COMPACT, frame
 from tofcapture.rig import SPEED_OF_LIGHT
-from tofcapture_model import multipath
-from tofcapture_model.geometry import doubled_parts, local_planes, side_window_planes, unit
-from tofcapture_model.intrinsics import rays, scale_intrinsics
-from tofcapture_model.metrics import angles_deg
-from tofcapture_model.multipath import STEP, cues, exchange_error, halo_error, surface
-from tofcapture_model.networks import CUE_SCALE, FIT_RADII, CompactInputs, Raw2Depth, Raw2Normal
+from tofcapture_model.evaluation.metrics import angles_deg
+from tofcapture_model.geometry.intrinsics import rays, scale_intrinsics
+from tofcapture_model.geometry.maps import doubled_parts, local_planes, side_window_planes, unit
+from tofcapture_model.networks import multipath
+from tofcapture_model.networks.heads import (
+    CUE_SCALE,
+    FIT_RADII,
+    CompactInputs,
+    Raw2Depth,
+    Raw2Normal,
+)
+from tofcapture_model.networks.multipath import STEP, cues, exchange_error, halo_error, surface
 
 RATIO, CUES, SMOOTH = 6, slice(9, 13), 16
 """Channels: log ratio of the amplitudes, cues, first smoothed depth."""

@@ -21,17 +21,15 @@ from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError
 from tofcapture.frames import TofInfo
 from tofcapture.rig import Rig, dumps_rig
-from tofcapture_model import neighbours, onnx_backend
-from tofcapture_model import predict as predicting
-from tofcapture_model.augment import RawItem
-from tofcapture_model.augment import crop as crop_item
-from tofcapture_model.augment import flip as flip_item
-from tofcapture_model.chamfer import candidate_shifts, robust_chamfer
 from tofcapture_model.config import Config, Network, Stage, preset
-from tofcapture_model.data import FrameDataset, collate, crop, frame_decoder, mirror
-from tofcapture_model.evaluate import evaluate
-from tofcapture_model.geometry import depth_to_normals, propagate_depth, unproject
-from tofcapture_model.intrinsics import (
+from tofcapture_model.data.augment import RawItem
+from tofcapture_model.data.augment import crop as crop_item
+from tofcapture_model.data.augment import flip as flip_item
+from tofcapture_model.data.frames import FrameDataset, collate, crop, frame_decoder, mirror
+from tofcapture_model.data.raw_input import NOMINAL_CAMERA
+from tofcapture_model.evaluation.evaluate import evaluate
+from tofcapture_model.geometry.decoder import TorchDecoder
+from tofcapture_model.geometry.intrinsics import (
     cut_intrinsics,
     expect_usable,
     intrinsics_of,
@@ -41,11 +39,14 @@ from tofcapture_model.intrinsics import (
     thin_intrinsics,
     with_lens,
 )
-from tofcapture_model.multipath import _patches, cues
-from tofcapture_model.predict import Predictor, predict
-from tofcapture_model.raw_input import NOMINAL_CAMERA
-from tofcapture_model.torch_decoder import TorchDecoder
-from tofcapture_model.train import train
+from tofcapture_model.geometry.maps import depth_to_normals, propagate_depth, unproject
+from tofcapture_model.inference import onnx_backend
+from tofcapture_model.inference import predict as predicting
+from tofcapture_model.inference.predict import Predictor, predict
+from tofcapture_model.losses.chamfer import neighbours
+from tofcapture_model.losses.chamfer.robust import candidate_shifts, robust_chamfer
+from tofcapture_model.networks.multipath import _patches, cues
+from tofcapture_model.training.train import train
 
 PLAIN = Camera(120, 90, 95.0, 100.0, 58.4, 50.7)
 LENS = replace(PLAIN, distortion=(-0.2, 0.06, 0.002, -0.003, 0.01))
@@ -341,7 +342,7 @@ def test_an_export_takes_any_lens(tmp_path, monkeypatch):
     """One export serves cameras with and without a lens; one made before lenses were known says what to do."""
     pytest.importorskip("onnxruntime")
     onnx = pytest.importorskip("onnx")
-    from tofcapture_model.export import export
+    from tofcapture_model.inference.export import export
 
     monkeypatch.setattr(predicting, "WARM", 0)
     monkeypatch.setattr(predicting, "RUNS", 1)

@@ -10,7 +10,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from tofcapture_model.metrics import Score, angles_deg
+from tofcapture_model.evaluation.metrics import Score, angles_deg
 
 
 def score(depth, gt, mask, normals=None, gt_normals=None, measured=None, scale=1.0):

@@ -12,8 +12,6 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from tofcapture.errors import ConfigError
-from tofcapture_model.baselines.sensor import estimate as sensor_estimate
-from tofcapture_model.baselines.sensor import upsample_depth
 from tofcapture_model.config import (
     Config,
     Network,
@@ -25,10 +23,12 @@ from tofcapture_model.config import (
     preset,
     presets,
 )
-from tofcapture_model.frame import Frame
-from tofcapture_model.joint import JointModel
-from tofcapture_model.unet import UNet, bilinear_logits, convex_upsample, pad_to_multiple
-from tofcapture_model.zoo import build_model, select_stage
+from tofcapture_model.data.frame import Frame
+from tofcapture_model.networks.baselines.sensor import estimate as sensor_estimate
+from tofcapture_model.networks.baselines.sensor import upsample_depth
+from tofcapture_model.networks.joint import JointModel
+from tofcapture_model.networks.unet import UNet, bilinear_logits, convex_upsample, pad_to_multiple
+from tofcapture_model.networks.zoo import build_model, select_stage
 
 TINY_PAPER = Network(width=2, levels=3, refine_iterations=1)
 TINY_COMPACT = replace(preset("demo").network, width=4, levels=2, refine_iterations=1)

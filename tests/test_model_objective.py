@@ -7,11 +7,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from tofcapture_model.chamfer import robust_chamfer
 from tofcapture_model.config import Losses
-from tofcapture_model.frame import Estimate, Target
-from tofcapture_model.geometry import unit, unproject
-from tofcapture_model.losses import (
+from tofcapture_model.data.frame import Estimate, Target
+from tofcapture_model.geometry.maps import unit, unproject
+from tofcapture_model.losses.chamfer.robust import robust_chamfer
+from tofcapture_model.losses.losses import (
     angle_loss,
     cosine_loss,
     error_map_loss,

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch")
 
 from tofcapture.camera import Camera
-from tofcapture_model.prediction import Prediction, write_prediction
+from tofcapture_model.inference.prediction import Prediction, write_prediction
 
 CAMERA = Camera(6, 4, 5.0, 5.5, 2.5, 1.0)
 

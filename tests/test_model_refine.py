@@ -9,11 +9,11 @@ torch = pytest.importorskip("torch")
 
 from tests.test_model_geometry import CAMERA, intrinsics, plane
 from tests.test_model_networks import TINY_COMPACT, frame
-from tofcapture_model.geometry import depth_to_normals, propagate_depth, unit
-from tofcapture_model.intrinsics import scale_intrinsics
-from tofcapture_model.joint import JointModel
-from tofcapture_model.losses import MIN_ERROR
-from tofcapture_model.refine import Refinement
+from tofcapture_model.geometry.intrinsics import scale_intrinsics
+from tofcapture_model.geometry.maps import depth_to_normals, propagate_depth, unit
+from tofcapture_model.losses.losses import MIN_ERROR
+from tofcapture_model.networks.joint import JointModel
+from tofcapture_model.networks.refine import Refinement
 
 K = intrinsics(CAMERA, torch.float32)
 

@@ -28,15 +28,15 @@ from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.ops.phase import taps
 from tofcapture.poses import look_at
 from tofcapture.rig import SPEED_OF_LIGHT, Rig
-from tofcapture_model.checkpoint import save_model
 from tofcapture_model.config import preset
+from tofcapture_model.networks.zoo import build_model
 from tofcapture_model.report import write_report
 from tofcapture_model.report.alignment import alignment
 from tofcapture_model.report.rigs import origin_of_alignment, transforms
 from tofcapture_model.report.scores import headline, tables, tiles
 from tofcapture_model.report.training import loss_chart
-from tofcapture_model.runlog import read_metrics
-from tofcapture_model.zoo import build_model
+from tofcapture_model.training.checkpoint import save_model
+from tofcapture_model.training.runlog import read_metrics
 
 CAMERA = Camera(64, 48, 50.0, 52.0, 31.0, 24.5)
 SECTIONS = ("numbers", "examples", "alignment", "rig", "made", "limits")

@@ -13,12 +13,12 @@ torch = pytest.importorskip("torch")
 from tests.analytic import make_dataset
 from tests.test_model_baselines import target
 from tests.test_model_networks import frame
-from tofcapture_model import learner as module
 from tofcapture_model.config import preset
-from tofcapture_model.evaluate import ONE_SIGMA, calibrate
-from tofcapture_model.learner import MAX_NORM, Group, Learner
-from tofcapture_model.runlog import Position
-from tofcapture_model.zoo import build_model
+from tofcapture_model.evaluation.evaluate import ONE_SIGMA, calibrate
+from tofcapture_model.networks.zoo import build_model
+from tofcapture_model.training import learner as module
+from tofcapture_model.training.learner import MAX_NORM, Group, Learner
+from tofcapture_model.training.runlog import Position
 
 
 def small(rank=0, **training):

@@ -17,12 +17,12 @@ from tests.analytic import make_dataset
 from tofcapture.cli import main
 from tofcapture.files.manifest import load_manifest, write_manifest
 from tofcapture.frames import TofInfo
-from tofcapture_model import evaluate, suite
-from tofcapture_model.checkpoint import find_model, save_model
 from tofcapture_model.config import preset
-from tofcapture_model.learned import learned_from
-from tofcapture_model.tables import SUITES, Column, Suite, cells, write_tables
-from tofcapture_model.zoo import build_model
+from tofcapture_model.evaluation import evaluate, suite
+from tofcapture_model.evaluation.tables import SUITES, Column, Suite, cells, write_tables
+from tofcapture_model.networks.zoo import build_model
+from tofcapture_model.training.checkpoint import find_model, save_model
+from tofcapture_model.training.learned import learned_from
 
 SIX = {
     "modulation_hz": (20e6,) * 3 + (100e6,) * 3,
@@ -220,7 +220,7 @@ def test_the_right_sigma_is_the_best_not_the_largest():
 
 def test_names_are_escaped_in_every_kind_of_table(tmp_path, monkeypatch):
     """Whatever somebody calls a run, LaTeX and Markdown print it."""
-    monkeypatch.setattr("tofcapture_model.tables.SUITES", {"main": Suite("Title", (COLUMN,))})
+    monkeypatch.setattr("tofcapture_model.evaluation.tables.SUITES", {"main": Suite("Title", (COLUMN,))})
     name = r"a&b#1${x}~y^z\w_5%|c"
     write_tables(tmp_path / "r.json", {"methods": {name: {"mae": 0.001}, "other": {"mae": 0.002}}}, ["main"])
     tex = r"a\&b\#1\$\{x\}\textasciitilde{}y\textasciicircum{}z\textbackslash{}w\_5\%\textbar{}c"

@@ -22,10 +22,10 @@ from tofcapture.errors import DataError
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import taps as taps_of
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError
-from tofcapture_model import torch_decoder
-from tofcapture_model.data import batched, make_frame
-from tofcapture_model.raw_input import NOMINAL_RANGE_ERRORS
-from tofcapture_model.torch_decoder import TorchDecoder, fill_nearest
+from tofcapture_model.data.frames import batched, make_frame
+from tofcapture_model.data.raw_input import NOMINAL_RANGE_ERRORS
+from tofcapture_model.geometry import decoder as torch_decoder
+from tofcapture_model.geometry.decoder import TorchDecoder, fill_nearest
 
 CAMERA = Camera(60, 45, 48.0, 49.0, 28.6, 23.1)
 LENS = replace(CAMERA, distortion=(-0.2, 0.05, 0.001, -0.002, 0.0))

@@ -21,15 +21,15 @@ from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.cache import pack
 from tofcapture.files.seal import sha256_of
-from tofcapture_model import progress as progressing
-from tofcapture_model.checkpoint import load_model, load_resume
 from tofcapture_model.config import Network, Stage, preset
-from tofcapture_model.data import FrameDataset, batched
-from tofcapture_model.evaluate import evaluate
-from tofcapture_model.learner import Learner
-from tofcapture_model.predict import predict
-from tofcapture_model.runlog import Position
-from tofcapture_model.train import _Run, train
+from tofcapture_model.data.frames import FrameDataset, batched
+from tofcapture_model.evaluation.evaluate import evaluate
+from tofcapture_model.inference.predict import predict
+from tofcapture_model.training import progress as progressing
+from tofcapture_model.training.checkpoint import load_model, load_resume
+from tofcapture_model.training.learner import Learner
+from tofcapture_model.training.runlog import Position
+from tofcapture_model.training.train import _Run, train
 
 
 @pytest.fixture(scope="module")
@@ -322,7 +322,7 @@ def test_holes_do_not_reach_the_output(dataset, trained):
     data = FrameDataset(dataset, "test")
     raw = data.readers["scene-2"].raw(0, 0).copy()
     raw[:, 30:50, 40:60] = 4095
-    from tofcapture_model.data import make_frame
+    from tofcapture_model.data.frames import make_frame
 
     reader = data.readers["scene-2"]
     frame = make_frame(raw, reader.info, reader.camera)
@@ -337,7 +337,7 @@ def test_two_processes_train_together(dataset, tmp_path):
     """torchrun with two CPU processes: one checkpoint, both ranks take part."""
     code = (
         "import sys; from pathlib import Path; from dataclasses import replace\n"
-        "from tofcapture_model.config import preset, Stage; from tofcapture_model.train import train\n"
+        "from tofcapture_model.config import preset, Stage; from tofcapture_model.training.train import train\n"
         "c = preset('demo'); c = replace(c, network=replace(c.network, width=2, levels=2), stages=(Stage('joint', 1),),"
         " training=replace(c.training, batch=2, crop=(48, 64)))\n"
         "print(train(c, Path(sys.argv[1]), Path(sys.argv[2])).steps)\n"

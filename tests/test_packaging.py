@@ -142,7 +142,7 @@ def test_installed_wheel_predicts_with_its_own_weights(tmp_path, wheel):
     if not (ROOT / "tofcapture_model/weights/model.safetensors").exists():
         pytest.skip("no weights are bundled in this tree")
     from tests.test_model_predict import table_top
-    from tofcapture_model.raw_input import NOMINAL_CAMERA
+    from tofcapture_model.data.raw_input import NOMINAL_CAMERA
 
     words = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", tmp_path / "site", wheel]
     subprocess.run([str(w) for w in words], check=True, capture_output=True)

@@ -15,9 +15,9 @@ from tofcapture.cli import main
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
 from tofcapture.rig import dumps_rig
-from tofcapture.viewer import open_source
-from tofcapture.viewer.colours import GOOD, GREY, MASK, limits, paint
-from tofcapture.viewer.shots import Panel, Shot, Source
+from tofcapture.viz import open_source
+from tofcapture.viz.colours import GOOD, GREY, MASK, limits, paint
+from tofcapture.viz.shots import Panel, Shot, Source
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
@@ -175,7 +175,7 @@ def _text(path, text, encoding="utf-8"):
 def server(dataset, tmp_path):
     """The page on a free port."""
     pytest.importorskip("rerun")
-    from tofcapture.viewer.web import make_server
+    from tofcapture.viz.web import make_server
 
     rrd = tmp_path / "x.rrd"
     assert main(["view", str(dataset), "--save", str(rrd)]) == 0
@@ -240,7 +240,7 @@ def test_page_opens_in_chromium_and_asks_nobody_else(server):
 
 def test_reports_nothing(tmp_path):
     """The window's environment carries a configuration that says no."""
-    from tofcapture.viewer.web import quiet_environment
+    from tofcapture.viz.web import quiet_environment
 
     env = quiet_environment(tmp_path)
     assert (
@@ -253,7 +253,7 @@ def test_reports_nothing(tmp_path):
 def test_rerun_leaves_no_process_behind():
     """The server that the page is taken from is gone afterwards."""
     pytest.importorskip("rerun")
-    from tofcapture.viewer.web import page_files
+    from tofcapture.viz.web import page_files
 
     before = _servers()
     assert b"const own" in page_files()["/index.html"]

@@ -15,8 +15,8 @@ from typing import Any
 from tofcapture.command import Command, Outcome
 from tofcapture.errors import ConfigError, TofError
 from tofcapture_model.config import Config, load_config, preset, presets
-from tofcapture_model.progress import progress
-from tofcapture_model.tables import SUITES
+from tofcapture_model.evaluation.tables import SUITES
+from tofcapture_model.training.progress import progress
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # malloc.h
 
@@ -120,7 +120,7 @@ def _config(args: argparse.Namespace) -> Config:
 def _start(name: str | None) -> Path | None:
     if name is None:
         return None
-    from tofcapture_model.checkpoint import find_model
+    from tofcapture_model.training.checkpoint import find_model
 
     return find_model(None if name == "bundled" else Path(name))
 
@@ -128,7 +128,7 @@ def _start(name: str | None) -> Path | None:
 def _train(args: argparse.Namespace) -> Outcome:
     config = _config(args)
     _share_cores()
-    from tofcapture_model.train import train
+    from tofcapture_model.training.train import train
 
     with progress() as report:
         done = train(
@@ -184,7 +184,7 @@ def _evaluate(args: argparse.Namespace) -> Outcome:
     _share_cores()
     if args.suite:
         return _suite(args)
-    from tofcapture_model.evaluate import comparison, evaluate
+    from tofcapture_model.evaluation.evaluate import comparison, evaluate
 
     weights = _one_network(args.weights)
     with progress() as report, _no_going_on():
@@ -228,9 +228,9 @@ def _no_going_on() -> Iterator[None]:
 
 
 def _suite(args: argparse.Namespace) -> Outcome:
-    from tofcapture_model.checkpoint import find_model
-    from tofcapture_model.suite import read_weights, run_suite, seen_before
-    from tofcapture_model.tables import markdown
+    from tofcapture_model.evaluation.suite import read_weights, run_suite, seen_before
+    from tofcapture_model.evaluation.tables import markdown
+    from tofcapture_model.training.checkpoint import find_model
 
     with progress() as report:
         results = run_suite(
@@ -283,7 +283,7 @@ def _configure_predict(parser: argparse.ArgumentParser) -> None:
 
 def _predict(args: argparse.Namespace) -> Outcome:
     _keep_memory()
-    from tofcapture_model.predict import predict
+    from tofcapture_model.inference.predict import predict
 
     result = predict(
         args.input,
@@ -335,8 +335,8 @@ def _configure_export(parser: argparse.ArgumentParser) -> None:
 
 def _export(args: argparse.Namespace) -> Outcome:
     _share_cores()
-    from tofcapture_model.checkpoint import find_model, names_bundled
-    from tofcapture_model.export import SUFFIX, export
+    from tofcapture_model.inference.export import SUFFIX, export
+    from tofcapture_model.training.checkpoint import find_model, names_bundled
 
     # the bundled weights are no place to write to
     beside = Path("model") if names_bundled(args.weights) else find_model(args.weights)

@@ -36,7 +36,7 @@ class Network:
     ----------
     kind
         ``paper``: three U-Nets; ``compact``: one small U-Net with three heads on classical features; ``su2018``, ``guo2018``,
-        ``coarse-fine``: published networks (:mod:`tofcapture_model.baselines`), of which ``su2018`` has a width and none has
+        ``coarse-fine``: published networks (:mod:`tofcapture_model.networks.baselines`), of which ``su2018`` has a width and none has
         any of the other keys.
     width, levels
         Channels of the first level and number of levels of every U-Net.
@@ -197,7 +197,7 @@ class Training:
         the training device, so that no frame is ever seen twice.
     phase_error
         Radians; above 0 every crop is given an error of calibration of its own, offset and wiggling of each frequency, as another
-        camera of the make would have (:func:`tofcapture_model.augment.redraw_calibration`).
+        camera of the make would have (:func:`tofcapture_model.data.augment.redraw_calibration`).
     flip
         Mirror frames at random: right as far as the light source stands near the lens.
     schedule

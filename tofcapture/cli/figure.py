@@ -54,7 +54,7 @@ def _run(args: argparse.Namespace) -> Outcome:
         raise UsageError(f"--rows: expected 1 or more, got {args.rows}")
     if args.view is not None and args.view < 0:
         raise UsageError(f"--view: expected 0 or more, got {args.view}")
-    from tofcapture.viewer.figures import Choice, write_figure
+    from tofcapture.viz.figures.write import Choice, write_figure
 
     choice = Choice(args.scene, args.view, args.rows or 4, args.prediction, args.rig)
     words = write_figure(args.kind, args.path, args.out, choice)

@@ -14,7 +14,7 @@ from tofcapture.command import Command, Outcome
 from tofcapture.errors import UsageError
 
 if TYPE_CHECKING:
-    from tofcapture.viewer.shots import Source
+    from tofcapture.viz.shots import Source
 
 _EVERY = 2.0  # s between lines of progress
 _SHEET, _RERUN = 12, 100  # shots
@@ -42,7 +42,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> Outcome:
-    from tofcapture.viewer import open_source
+    from tofcapture.viz import open_source
 
     if args.views is not None and args.views < 1:
         raise UsageError(f"--views: expected 1 or more, got {args.views}")
@@ -55,22 +55,22 @@ def _run(args: argparse.Namespace) -> Outcome:
 
 
 def _sheet(source: Source, path: Path, most: int) -> Outcome:
-    from tofcapture.viewer.sheet import write_sheet
+    from tofcapture.viz.sheet import write_sheet
 
     shots = write_sheet(source, path, most, _progress("read"))
     return _written(source, path, shots)
 
 
 def _saved(source: Source, path: Path, most: int) -> Outcome:
-    from tofcapture.viewer.rerun_file import write_rrd
+    from tofcapture.viz.rerun_file import write_rrd
 
     shots = write_rrd(source, path, most, _progress("written"))
     return _written(source, path, shots)
 
 
 def _shown(source: Source, most: int, *, web: bool) -> Outcome:
-    from tofcapture.viewer.rerun_file import write_rrd
-    from tofcapture.viewer.web import show_page, show_window
+    from tofcapture.viz.rerun_file import write_rrd
+    from tofcapture.viz.web import show_page, show_window
 
     with tempfile.TemporaryDirectory(prefix="tofcapture-view-") as folder:
         path = Path(folder) / "view.rrd"

@@ -17,10 +17,10 @@ from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import Manifest
 from tofcapture.files.shard import GroundTruth, ShardReader
 from tofcapture.poses import Float64
-from tofcapture_model.baselines import sensor
-from tofcapture_model.data import batched, make_frame
-from tofcapture_model.frame import Frame
-from tofcapture_model.zoo import Model
+from tofcapture_model.data.frame import Frame
+from tofcapture_model.data.frames import batched, make_frame
+from tofcapture_model.networks.baselines import sensor
+from tofcapture_model.networks.zoo import Model
 
 Float32 = NDArray[np.float32]
 FRAME = 0  # of the burst; evaluate takes the same one

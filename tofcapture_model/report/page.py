@@ -14,13 +14,13 @@ from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.layout import SPLITS
 from tofcapture.files.manifest import Manifest, load_manifest, manifest_path
 from tofcapture.files.seal import sha256_of
-from tofcapture_model.learned import origin, sentence
 from tofcapture_model.report.alignment import alignment
 from tofcapture_model.report.examples import choose, describe_shard, load_examples
 from tofcapture_model.report.panels import panels
 from tofcapture_model.report.rigs import camera_rows, drawing, range_rows, transforms
 from tofcapture_model.report.scores import headline, sample, tables, tiles
 from tofcapture_model.report.training import Network, load_network, loss_chart, validations
+from tofcapture_model.training.learned import origin, sentence
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def render_page(sources: Sources, views: int) -> str:
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    text = (files("tofcapture_model") / "templates" / "report.html.j2").read_text(encoding="utf-8")
+    text = (files("tofcapture_model.report") / "report.html.j2").read_text(encoding="utf-8")
     page: str = environment.from_string(text).render(context(sources, views))
     return page + "\n"
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tofcapture.files.layout import MaskBit
 from tofcapture.poses import Float64
-from tofcapture_model.metrics import angles_deg
+from tofcapture_model.evaluation.metrics import angles_deg
 from tofcapture_model.report.clouds import SIZE, render, shaded_palette, side_view
 from tofcapture_model.report.examples import Answer, Example
 from tofcapture_model.report.pictures import (

@@ -10,10 +10,10 @@ from typing import Any
 
 from tofcapture.errors import ConfigError
 from tofcapture.files.seal import sha256_of
-from tofcapture_model.checkpoint import find_model, load_model
 from tofcapture_model.config import Config, dumps_config
-from tofcapture_model.runlog import read_metrics
-from tofcapture_model.zoo import Model
+from tofcapture_model.networks.zoo import Model
+from tofcapture_model.training.checkpoint import find_model, load_model
+from tofcapture_model.training.runlog import read_metrics
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM = 640, 220, 56, 34
 _MOST = 400  # points of a curve
@@ -26,7 +26,7 @@ class Network:
     Attributes
     ----------
     model, config, provenance
-        From :func:`tofcapture_model.checkpoint.load_model`.
+        From :func:`tofcapture_model.training.checkpoint.load_model`.
     name, sha256
         Of the file.
     parameters

@@ -1,0 +1,167 @@
+"""Residuals of an alignment, point by point, computed anew from the views of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.alignment.range_residual import RangeResidual, no_residual
+from calibration.board.rims import rim_cloud, stereo_rims, tof_rims
+from calibration.registration.clouds import stereo_cloud, surface_points, tof_depth
+from calibration.registration.gate import residuals
+from calibration.registration.pairs import calibration_views
+from tofcapture.camera import Camera
+from tofcapture.frames import View
+from tofcapture.poses import Float64, check_transform, invert, transform
+
+MOST_VIEWS = 24  # views that are read for the page, evenly; each costs a second
+MOST_POINTS = 6000  # surface points per view
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Residuals of all views at the transform that was found, range residual taken off.
+
+    Attributes
+    ----------
+    camera
+        ToF intrinsics.
+    view
+        (N,) int, index of the view of each surface point.
+    pixel
+        (N, 2) float64, u and v of the point in the ToF image.
+    range, amplitude
+        (N,) float64: metres along the ray; raw units at the highest modulation frequency.
+    residual
+        (N,) float64, metres, along the stereo surface's normal; positive where ToF measures too far.
+    rims
+        (M,) float64, metres, ToF rims across stereo rims, signed.
+    poses
+        One (4, 4) ``T_tof_board`` per view: centroid of the points, normal of their plane.
+    outlines
+        (K, 2) convex stand-in for the board about that pose, metres.
+    """
+
+    camera: Camera
+    view: NDArray[np.intp]
+    pixel: Float64
+    range: Float64
+    amplitude: Float64
+    residual: Float64
+    rims: Float64
+    poses: list[Float64]
+    outlines: list[Float64]
+
+
+def sample_recording(
+    recording: Path, evidence: Mapping[str, Any], progress: Callable[[str, int, int], None]
+) -> Samples:
+    """Measure the residuals of a recording's views.
+
+    Parameters
+    ----------
+    recording
+        Folder with ``views/calibration``.
+    evidence
+        For ``T_tof_stereo``, ``range_residual`` and which views were used.
+    progress
+        Called with a stage, steps done and steps in all.
+
+    Raises
+    ------
+    DataError
+        No views, or unreadable ones.
+    """
+    from tofcapture.files.view import read_view
+
+    T_stereo_tof = invert(check_transform(evidence["T_tof_stereo"], "evidence: T_tof_stereo"))
+    paths = _chosen(calibration_views(recording), evidence)
+    parts = []
+    for i, path in enumerate(paths):
+        progress("evidence page", i, len(paths))
+        parts.append(_sample(read_view(path), i, T_stereo_tof, evidence))
+    return _joined(parts)
+
+
+def _chosen(paths: list[Path], evidence: Mapping[str, Any]) -> list[Path]:
+    refused = {Path(p["view"]).name for p in evidence.get("pairs", ()) if not p.get("accepted", True)}
+    good = [p for p in paths if p.name not in refused] or paths
+    return [good[i] for i in np.unique(np.linspace(0, len(good) - 1, MOST_VIEWS).round().astype(int))]
+
+
+def residual_from(evidence: Mapping[str, Any], camera: Camera) -> RangeResidual:
+    """Range residual that an evidence states; none where it states none.
+
+    Orders that :data:`calibration.alignment.range_residual.ORDERS` does not hold are left out.
+    """
+    from calibration.alignment.range_residual import ORDERS
+
+    table = evidence.get("range_residual")
+    if not isinstance(table, Mapping) or "modulation_hz" not in table:
+        return no_residual(camera, 100e6)
+    waves = {int(m): (float(a), float(b)) for m, a, b in table.get("harmonics", ())}
+    c = [table.get("offset", 0.0), table.get("per_pixel_radius", 0.0)]
+    c += [x for m in ORDERS for x in waves.get(m, (0.0, 0.0))]
+    return RangeResidual(camera, float(table["modulation_hz"]), np.asarray(c, dtype=np.float64))
+
+
+def _sample(view: View, index: int, T_stereo_tof: Float64, evidence: Mapping[str, Any]) -> Samples:
+    camera = view.tof.info.camera
+    phasor, depth = tof_depth(view.tof)
+    raw = surface_points(view.tof, depth)
+    raw = raw[:: max(1, len(raw) // MOST_POINTS)]
+    points = residual_from(evidence, camera).correct(raw)
+    found = residuals(points, stereo_cloud(view.stereo), T_stereo_tof)
+    kept = raw[found.source]
+    pixel, _ = camera.project(kept)
+    column, row = np.rint(pixel).astype(int).T
+    held = rim_cloud(stereo_rims(view.stereo.points), T_stereo_tof[:3, 3])
+    rims = tof_rims(phasor, depth, camera).points
+    across = residuals(rims, held, T_stereo_tof).distance if len(held) and len(rims) else np.zeros(0)
+    pose, outline = _stand_in(points)
+    return Samples(
+        camera,
+        np.full(len(kept), index),
+        pixel,
+        np.linalg.norm(kept, axis=1),
+        np.abs(phasor[-1])[row, column],
+        -found.distance,
+        across,
+        [pose] if len(points) > 3 else [],
+        [outline] if len(points) > 3 else [],
+    )
+
+
+def _stand_in(points: Float64) -> tuple[Float64, Float64]:
+    """Pose and outline (32, 2) of a plane's points (N, 3): an ellipse that covers what they cover, normal towards the camera."""
+    if len(points) <= 3:
+        return np.eye(4), np.zeros((0, 2))
+    centre = points.mean(axis=0)
+    _, singular, axes = np.linalg.svd(points - centre, full_matrices=False)
+    x, z = axes[0], axes[2] if axes[2] @ centre < 0 else -axes[2]
+    half = 2 * singular[:2] / np.sqrt(len(points))
+    angle = 2 * np.pi * np.arange(32) / 32
+    outline = half * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return transform(np.stack([x, np.cross(z, x), z], axis=1), centre), outline
+
+
+def _joined(parts: list[Samples]) -> Samples:
+    def all_of(name: str) -> Any:
+        return np.concatenate([getattr(p, name) for p in parts])
+
+    return Samples(
+        camera=parts[0].camera,
+        view=all_of("view"),
+        pixel=all_of("pixel"),
+        range=all_of("range"),
+        amplitude=all_of("amplitude"),
+        residual=all_of("residual"),
+        rims=all_of("rims"),
+        poses=[T for p in parts for T in p.poses],
+        outlines=[o for p in parts for o in p.outlines],
+    )

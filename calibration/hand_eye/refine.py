@@ -1,0 +1,223 @@
+"""Maximum-likelihood hand-eye over all poses: robust, weighted by the noise it finds, with covariance.
+
+The residual of a pair is the displacement and the rotation between predicted and seen board, in the camera frame. It is
+taken as multivariate Student-t. Its scatter is the camera's own, 6 x 6 and the same in every view, plus the arm's, which acts at
+the flange and reaches the board over a lever that differs from pose to pose. Both come out of the data by
+expectation-maximisation, and with them the weights of rotation against translation and of near against far poses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.hand_eye.closed_form import residuals
+from tofcapture.poses import Float64, rotation_exp, transform
+
+FREEDOM = 8.0  # degrees of freedom of Student's t: efficient on Gaussian noise, and outliers lose their vote
+PRIOR = 12.0  # pairs' worth of belief that the camera's scatter is isotropic in each half
+FLOOR = (1e-7, 1e-7)  # m, rad; keeps noise-free data solvable
+ITERATIONS = 60
+SANDWICH = 12  # pairs from which on their own scatter is believed more than the model
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A refined solution.
+
+    Attributes
+    ----------
+    X, Z
+        (4, 4).
+    residual
+        (N, 6) metres and radians, camera frame.
+    weight
+        (N,) in (0, 1.75]; near 0 for outliers.
+    scatter
+        (N, 6, 6) covariance of each pair's noise.
+    covariance
+        (12, 12) of (t_X, phi_X, t_Z, phi_Z): metres, radians, rotations in the left tangent space.
+    left_out
+        (N, 6) residual of each pair under the solution without it; NaN where the rest determines nothing.
+    """
+
+    X: Float64
+    Z: Float64
+    residual: Float64
+    weight: Float64
+    scatter: Float64
+    covariance: Float64
+    left_out: Float64
+
+    @property
+    def noise(self) -> tuple[float, float]:
+        """Standard deviation per axis of one pair: metres, radians."""
+        d = np.einsum("nii->i", self.scatter) / len(self.scatter)
+        return float(np.sqrt(d[:3].mean())), float(np.sqrt(d[3:].mean()))
+
+    @property
+    def distance(self) -> Float64:
+        """(N,) Mahalanobis distance of each pair."""
+        return np.asarray(np.sqrt(_mahalanobis2(self.residual, _inverse(self.scatter))))
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of the pairs under the fitted Student-t, up to a constant."""
+        logdet = np.linalg.slogdet(self.scatter)[1].sum()
+        return float(-0.5 * logdet - 0.5 * (FREEDOM + 6) * np.log1p(self.distance**2 / FREEDOM).sum())
+
+
+def refine(
+    P: Float64,
+    B: Float64,
+    X: Float64,
+    Z: Float64,
+    noise: tuple[float, float],
+    blocks: int | None = None,
+    *,
+    eye_to_hand: bool = False,
+) -> Refined:
+    """Refine X and Z from a start by Gauss-Newton inside expectation-maximisation.
+
+    Parameters
+    ----------
+    P, B
+        (N, 4, 4) pairs, N >= 3.
+    X, Z
+        Start, (4, 4).
+    noise
+        First guess of the noise per axis: metres, radians.
+    blocks
+        Stretches of consecutive pairs that share their errors (streams); each pair is its own when None.
+    eye_to_hand
+        Where the flange is: P is T_flange_base, not T_base_flange.
+
+    Returns
+    -------
+    Refined
+    """
+    whole = np.repeat(np.square(np.maximum(noise, FLOOR)), 3)
+    camera, arm = np.diag(whole / 2), whole / 2
+    for _ in range(ITERATIONS):
+        r, J = residuals(P, B, X, Z), jacobian(P, X, Z)
+        lever = _lever(P, X, Z, eye_to_hand=eye_to_hand)
+        information = _inverse(_total(camera, arm, lever))
+        weight = _weights(r, information)
+        step = _solve(J, r, weight, information)
+        X, Z = _moved(X, step[:6]), _moved(Z, step[6:])
+        camera, arm = _sources(residuals(P, B, X, Z), weight, camera, arm, lever, information)
+        if np.abs(step).max() < 1e-9:
+            break
+    r, J = residuals(P, B, X, Z), jacobian(P, X, Z)
+    scatter = _total(camera, arm, _lever(P, X, Z, eye_to_hand=eye_to_hand))
+    weight = _weights(r, _inverse(scatter))
+    return Refined(X, Z, r, weight, scatter, *_uncertainty(J, r, weight, scatter, blocks))
+
+
+def _lever(P: Float64, X: Float64, Z: Float64, *, eye_to_hand: bool) -> Float64:
+    """(N, 6, 6) derivative of the residual by the arm's own error at the flange, up to its sign."""
+    if eye_to_hand:
+        turn = np.swapaxes(P[:, :3, :3] @ X[:3, :3], 1, 2)
+        board = np.broadcast_to(Z[:3, 3], (len(P), 3))
+    else:
+        turn = np.broadcast_to(X[:3, :3].T, (len(P), 3, 3))
+        board = np.einsum("nji,nj->ni", P[:, :3, :3], Z[:3, 3] - P[:, :3, 3])
+    out = np.zeros((len(P), 6, 6))
+    out[:, :3, :3], out[:, 3:, 3:] = -turn, -turn
+    out[:, :3, 3:] = turn @ _hats(board)
+    return out
+
+
+def _hats(y: Float64) -> Float64:
+    o = np.zeros(len(y))
+    flat = np.stack([o, -y[:, 2], y[:, 1], y[:, 2], o, -y[:, 0], -y[:, 1], y[:, 0], o], axis=1)
+    return flat.reshape(-1, 3, 3)
+
+
+def _total(camera: Float64, arm: Float64, lever: Float64) -> Float64:
+    out: Float64 = camera + (lever * arm) @ np.swapaxes(lever, 1, 2)
+    return out
+
+
+def _sources(
+    r: Float64, weight: Float64, camera: Float64, arm: Float64, lever: Float64, information: Float64
+) -> tuple[Float64, Float64]:
+    """Share the residuals between camera and arm: one step of expectation-maximisation.
+
+    The camera's scatter is drawn towards isotropy; the arm's is isotropic in each half. Twelve parameters are two pairs' worth of
+    freedom.
+    """
+    n = len(r)
+    root = np.sqrt(weight * n / max(n - 2, 1))[:, None] * np.einsum("nij,nj->ni", information, r)
+    seen = root @ camera
+    S = (seen.T @ seen) / n + camera - camera @ information.mean(axis=0) @ camera
+    d = np.diag(S)
+    isotropic = np.repeat([max(d[:3].mean(), FLOOR[0] ** 2), max(d[3:].mean(), FLOOR[1] ** 2)], 3)
+    felt = np.einsum("nji,nj->ni", lever, root) * arm
+    kept = np.einsum("nji,njk,nki->i", lever, information, lever) / n
+    e = np.square(felt).mean(axis=0) + arm - arm**2 * kept
+    return (n * S + PRIOR * np.diag(isotropic)) / (n + PRIOR), np.repeat([e[:3].mean(), e[3:].mean()], 3)
+
+
+def jacobian(P: Float64, X: Float64, Z: Float64) -> Float64:
+    """Derivative (N, 6, 12) of :func:`hand_eye_closed.residuals` by (t_X, phi_X, t_Z, phi_Z)."""
+    back = X[:3, :3].T
+    R_Pt = np.swapaxes(P[:, :3, :3], 1, 2)
+    y = np.einsum("nij,nj->ni", R_Pt, Z[:3, 3] - P[:, :3, 3]) - X[:3, 3]
+    J = np.zeros((len(P), 6, 12))
+    J[:, :3, 0:3] = -back
+    J[:, :3, 3:6] = back @ _hats(y)
+    J[:, :3, 6:9] = back @ R_Pt
+    J[:, 3:, 3:6] = -back
+    J[:, 3:, 9:12] = back @ R_Pt
+    return J
+
+
+def _moved(T: Float64, step: Float64) -> Float64:
+    return transform(rotation_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3])
+
+
+def _mahalanobis2(r: Float64, information: Float64) -> Float64:
+    return np.asarray(np.einsum("ni,nij,nj->n", r, information, r))
+
+
+def _inverse(S: Float64) -> Float64:
+    return np.asarray(np.linalg.inv(S), dtype=np.float64)
+
+
+def _weights(r: Float64, information: Float64) -> Float64:
+    return np.asarray((FREEDOM + 6) / (FREEDOM + _mahalanobis2(r, information)))
+
+
+def _solve(J: Float64, r: Float64, weight: Float64, information: Float64) -> Float64:
+    L = np.swapaxes(np.linalg.cholesky(information), 1, 2)
+    root = np.sqrt(weight)[:, None]
+    left = (root[:, :, None] * (L @ J)).reshape(-1, 12)
+    right = (root * np.einsum("nij,nj->ni", L, r)).reshape(-1)
+    return np.asarray(-np.linalg.lstsq(left, right, rcond=None)[0], dtype=np.float64)
+
+
+def _uncertainty(
+    J: Float64, r: Float64, weight: Float64, scatter: Float64, blocks: int | None
+) -> tuple[Float64, Float64]:
+    """Covariance and left-out residuals.
+
+    With a dozen pairs or more the covariance is the sandwich of the scores of pairs or blocks: it holds when the noise model
+    does not. A left-out solution is one Newton step away from the full one, since the problem is nearly linear there.
+    """
+    pull = weight[:, None, None] * np.linalg.inv(scatter)
+    each = np.einsum("nia,nij,njb->nab", J, pull, J)
+    H, score = each.sum(axis=0), np.einsum("nia,nij,nj->na", J, pull, r)
+    inverse = np.linalg.pinv(H)
+    covariance = inverse
+    n = len(r)
+    if n >= SANDWICH:
+        groups = score if blocks is None else np.stack([b.sum(axis=0) for b in np.array_split(score, blocks)])
+        covariance = inverse @ (groups.T @ groups) @ inverse * len(groups) / (len(groups) - 2)
+    left_out = np.full_like(r, np.nan)
+    for i in range(n):
+        rest = H - each[i]
+        if np.linalg.cond(rest) < 1e14:
+            left_out[i] = r[i] + J[i] @ np.linalg.solve(rest, score[i])
+    return covariance, left_out

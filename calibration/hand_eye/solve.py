@@ -1,0 +1,226 @@
+"""Hand-eye calibration: where a camera sits on the hand, or beside the arm, and how well that is known.
+
+``A_i`` is the hand in the base (T_base_flange), ``B_i`` the target in the camera (T_camera_target). Camera in the hand:
+``A_i X B_i = Z`` with X = T_flange_camera and Z = T_base_target. Camera beside the arm: ``A_i^-1 X B_i = Z`` with
+X = T_base_camera and Z = T_flange_target. Closed forms start it, :mod:`calibration.hand_eye.refine` ends it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.hand_eye.checks import check_motion, check_numbers, check_pairing, clean
+from calibration.hand_eye.closed_form import daniilidis, distances, park_martin
+from calibration.hand_eye.consensus import consensus
+from calibration.hand_eye.diagnosis import check_agreement, oriented, target_scale
+from calibration.hand_eye.refine import Refined, refine
+from tofcapture.poses import Float64
+
+OUTLIER = 6.0  # sigma (6-D): 1 of 200,000 Gaussian pairs lies farther out
+FEW = 10  # pairs below which a result is called doubtful
+LOOSE = (0.005, np.radians(0.5))  # m, rad: standard deviations beyond which a result is called doubtful
+SCALE_OFF = 0.005  # relative
+
+
+@dataclass(frozen=True)
+class HandEye:
+    """A hand-eye calibration.
+
+    Attributes
+    ----------
+    X
+        (4, 4) T_flange_camera, or T_base_camera when the camera stands beside the arm.
+    Z
+        (4, 4) T_base_target, or T_flange_target.
+    eye_to_hand
+        True when the camera stands beside the arm.
+    residual
+        (N, 6) metres and radians, camera frame: predicted minus seen target.
+    left_out
+        (N, 6) the same under the solution without that pair; NaN where undetermined.
+    outliers
+        (N,) bool, pairs that lost their vote.
+    noise
+        Standard deviation per axis of one pair: metres, radians.
+    covariance
+        (6, 6) of X: metres, then rotation vector in radians, left tangent space.
+    motion
+        RMS relative rotation of the hand about its three principal axes, radians, descending.
+    scale
+        Factor that fits the target's distances to the arm's, and its standard deviation; (1, small) is right.
+    closed_forms
+        X of each closed form, by name.
+    warnings
+        What a person should look at.
+    """
+
+    X: Float64
+    Z: Float64
+    eye_to_hand: bool
+    residual: Float64
+    left_out: Float64
+    outliers: NDArray[np.bool_]
+    noise: tuple[float, float]
+    covariance: Float64
+    motion: tuple[float, float, float]
+    scale: tuple[float, float]
+    closed_forms: dict[str, Float64]
+    warnings: tuple[str, ...]
+
+    @property
+    def sigma(self) -> tuple[float, float]:
+        """Standard deviation of X: translation (metres) and rotation (radians), each the root of the trace."""
+        d = np.diag(self.covariance)
+        return float(np.sqrt(d[:3].sum())), float(np.sqrt(d[3:].sum()))
+
+    @property
+    def leave_one_out(self) -> tuple[float, float] | None:
+        """RMS length of the left-out residuals of the pairs that are no outliers: metres, radians; None if undetermined."""
+        kept = self.left_out[~self.outliers]
+        if not np.isfinite(kept).all():
+            return None
+        moved, turned = distances(kept)
+        return float(np.sqrt(np.mean(moved**2))), float(np.sqrt(np.mean(turned**2)))
+
+
+def solve_hand_eye(
+    hand: ArrayLike, target: ArrayLike, *, eye_to_hand: bool = False, blocks: int | None = None
+) -> HandEye:
+    """Calibrate hand and eye from pairs of poses, or refuse by name.
+
+    Parameters
+    ----------
+    hand
+        (N, 4, 4) T_base_flange, metres.
+    target
+        (N, 4, 4) T_camera_target of the same moments, metres.
+    eye_to_hand
+        The camera stands beside the arm and sees a target on the flange.
+    blocks
+        Stretches of consecutive pairs that share their errors, for the covariance of streams; None for single shots.
+
+    Returns
+    -------
+    HandEye
+
+    Raises
+    ------
+    DataError
+        NaN, mirrored or otherwise impossible poses, lists of different length.
+    HandEyeRefused
+        Motion or pairs that give no calibration; ``cause`` names why.
+    """
+    A, B = clean(hand, "hand poses"), clean(target, "target poses")
+    check_numbers(A, B)
+    motion = check_motion(A, B)
+    check_pairing(A, B)
+    P = oriented(A, eye_to_hand=eye_to_hand)
+    start = consensus(P, B)
+    check_agreement(A, B, start, eye_to_hand=eye_to_hand)
+    refined = refine(P, B, start.X, start.Z, start.noise, blocks, eye_to_hand=eye_to_hand)
+    return _result(P, B, refined, start.X, motion, eye_to_hand=eye_to_hand)
+
+
+def _result(
+    P: Float64,
+    B: Float64,
+    refined: Refined,
+    kronecker: Float64,
+    motion: tuple[float, float, float],
+    *,
+    eye_to_hand: bool,
+) -> HandEye:
+    outliers = refined.distance > OUTLIER
+    kept = ~outliers
+    scale = target_scale(P[kept], B[kept], refined.X[:3, :3])
+    forms = {
+        "park-martin": park_martin(P[kept], B[kept]),
+        "dual quaternions": daniilidis(P[kept], B[kept]),
+        "kronecker": kronecker,
+    }
+    result = HandEye(
+        refined.X,
+        refined.Z,
+        eye_to_hand,
+        refined.residual,
+        refined.left_out,
+        outliers,
+        refined.noise,
+        refined.covariance[:6, :6],
+        motion,
+        scale,
+        forms,
+        (),
+    )
+    return _with_warnings(result, B)
+
+
+def _with_warnings(result: HandEye, B: Float64) -> HandEye:
+    from dataclasses import replace
+
+    moved, turned = result.sigma
+    scale, off = result.scale
+    bad = np.flatnonzero(result.outliers)
+    behind = int((B[:, 2, 3] <= 0).sum())
+    said = (
+        (len(B) < FEW, f"only {len(B)} pairs: the error bars are themselves uncertain"),
+        (
+            moved > LOOSE[0] or turned > LOOSE[1],
+            f"loosely determined: {1e3 * moved:.1f} mm, {np.degrees(turned):.2f} deg",
+        ),
+        (len(bad) > 0, f"{len(bad)} pairs do not fit and lost their vote: {bad.tolist()}"),
+        (
+            abs(scale - 1) > max(SCALE_OFF, 4 * off),
+            f"the target's distances fit best multiplied by {scale:.4f} +- {off:.4f}: check its size and the camera's focal length",
+        ),
+        (
+            behind > len(B) / 2,
+            f"the target lies behind the camera in {behind} pairs: columns swapped, or a camera frame whose z points back",
+        ),
+    )
+    return replace(result, warnings=tuple(text for says, text in said if says))
+
+
+def refine_from_consensus(P: Float64, B: Float64) -> Refined:
+    """Solve without any gate: the consensus start, refined; for searches that solve many times."""
+    start = consensus(P, B)
+    return refine(P, B, start.X, start.Z, start.noise)
+
+
+def to_dict(result: HandEye) -> dict[str, Any]:
+    """Return the result as JSON types: the transforms in metres, summaries in mm and degrees."""
+    moved, turned = distances(result.residual)
+    loo = result.leave_one_out
+    names = (
+        ("T_base_camera", "T_flange_target") if result.eye_to_hand else ("T_flange_camera", "T_base_target")
+    )
+    return {
+        "format": "tofcapture-hand-eye",
+        "version": 1,
+        "units": "m",
+        "mount": "eye-to-hand" if result.eye_to_hand else "eye-in-hand",
+        names[0]: result.X.tolist(),
+        names[1]: result.Z.tolist(),
+        "pairs": len(result.residual),
+        "outliers": np.flatnonzero(result.outliers).tolist(),
+        "noise": _both(*result.noise),
+        "standard_error": _both(*result.sigma),
+        "covariance": result.covariance.tolist(),
+        "residual": {
+            "median": _both(float(np.median(moved)), float(np.median(turned))),
+            "max": _both(float(moved.max()), float(turned.max())),
+        },
+        "leave_one_out": None if loo is None else _both(*loo),
+        "motion_deg": np.degrees(result.motion).tolist(),
+        "target_scale": {"factor": result.scale[0], "standard_error": result.scale[1]},
+        "closed_forms": {name: X.tolist() for name, X in result.closed_forms.items()},
+        "warnings": list(result.warnings),
+    }
+
+
+def _both(metres: float, radians: float) -> dict[str, float]:
+    return {"translation_mm": 1e3 * metres, "rotation_deg": float(np.degrees(radians))}

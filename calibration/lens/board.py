@@ -1,0 +1,295 @@
+"""The lens from a board with cut-outs: every rim that the ToF camera sees against the nearest edge of the board's model.
+
+No centre of a hole is measured: a rim pixel's ray meets the board's front, and its distance to the nearest edge, in pixels, is the
+residual. Unknown are the lens, one pose per view, and by how much all plates look too large; ranges play no part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.board.model import Model, clear_of_walls, on_front
+from calibration.lens.model import LensRefused
+from calibration.registration.gate import tukey_weights
+from tofcapture.camera import Camera
+from tofcapture.errors import ConfigError, DataError
+from tofcapture.poses import Float64, exp
+
+MIN_VIEWS = 5
+FEW = 500  # rims of a view; the rest repeats them
+SCALES = (3.0, 2.0, 1.2, 0.8, 0.8, 0.8)  # px, Tukey's scale, a step each
+SETTLED = 0.002  # px, root mean square of what a step still moves
+MORE_STEPS = 12
+NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+STEP = np.array([0.01, 0.01, 0.01, 0.01, 1e-5, 1e-5, 1e-6, 1e-6, 1e-5])  # of a numerical derivative
+# One sigma of what a lens may be from where it starts: only what the views do not settle is held by it.
+PRIOR = np.array([30.0, 30.0, 15.0, 15.0, 0.5, 0.5, 0.01, 0.01, 0.5])
+MODELS = {"pinhole": 4, "k1 k2 p1 p2": 8, "k1 k2 p1 p2 k3": 9}
+BETTER = 0.98  # a richer lens must lower the error at left-out views to this share
+HALVINGS = 6  # of a step whose lens folds
+NOISE = 0.3  # px, of a rim, against the priors
+
+
+@dataclass(frozen=True)
+class BoardSeen:
+    """Rims of one view.
+
+    Attributes
+    ----------
+    name
+        Path of the view.
+    pixels
+        (N, 2) rims of the board, image as it was taken.
+    T_camera_board
+        (4, 4) first guess.
+    """
+
+    name: str
+    pixels: Float64
+    T_camera_board: Float64
+
+
+@dataclass(frozen=True)
+class BoardLens:
+    """A lens fitted to board views.
+
+    Attributes
+    ----------
+    camera
+        The answer.
+    model
+        Which of ``MODELS`` the views ask for.
+    sigma
+        (9,) one sigma of ``NAMES`` from leaving views out; 0 for what was held.
+    rms
+        Root mean square distance of rims to edges, pixels.
+    left_out
+        (V,) the same at each view with the lens of the others.
+    growth
+        How far rims lie off the material, pixels.
+    coverage
+        (2,) share of the image's width and height that rims span.
+    pixel_sigma
+        Largest one sigma over the image's corners of where a ray is seen, pixels, a common shift of pose taken off.
+    T_camera_board
+        One (4, 4) per view.
+    """
+
+    camera: Camera
+    model: str
+    sigma: Float64
+    rms: float
+    left_out: Float64
+    growth: float
+    coverage: Float64
+    pixel_sigma: float
+    T_camera_board: tuple[Float64, ...]
+
+
+@dataclass(frozen=True)
+class _State:
+    camera: Camera
+    growth: float
+    poses: tuple[Float64, ...]
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """One view's equations: of the lens and growth (N, 10), of the pose (N, 6), residual and weight (N,)."""
+
+    shared: Float64
+    own: Float64
+    residual: Float64
+    weight: Float64
+
+
+def fit_lens_to_board(model: Model, views: Sequence[BoardSeen], camera: Camera) -> BoardLens:
+    """Fit a lens to rims, as rich as the views ask for.
+
+    Parameters
+    ----------
+    model
+        The board.
+    views
+        At least five, tilted, that together reach the corners of the image.
+    camera
+        To start from, good to some per cent.
+
+    Raises
+    ------
+    DataError
+        Too few views.
+    LensRefused
+        No lens fits.
+    """
+    if len(views) < MIN_VIEWS:
+        raise DataError(
+            f"lens: expected at least {MIN_VIEWS} views with the board, got {len(views)}",
+            hint="record the board tilted 20 to 40 degrees in all directions, also in the corners of the image",
+        )
+    thin = [replace(v, pixels=v.pixels[:: max(1, len(v.pixels) // FEW)]) for v in views]
+    best: BoardLens | None = None
+    for name, free in MODELS.items():
+        try:
+            found = _fit(model, thin, best.camera if best else camera, name, free)
+        except ConfigError:  # it folds: the views do not ask for that much lens
+            if best is None:
+                raise
+            break
+        if best is None or _rms(found.left_out) < BETTER * _rms(best.left_out):
+            best = found
+    if best is None or best.rms > 1.0:
+        raise LensRefused(
+            f"lens refused, poor fit: rims lie {best.rms if best else np.nan:.2f} px off the board's edges, expected below 1",
+            hint="another board, a bent one, or a lens beyond this model (fish-eye)",
+        )
+    return best
+
+
+def _fit(model: Model, views: Sequence[BoardSeen], start: Camera, name: str, free: int) -> BoardLens:
+    state = _State(start, 0.0, tuple(v.T_camera_board for v in views))
+    begin = _values(start)
+    for step in range(len(SCALES) + MORE_STEPS):
+        scale = SCALES[min(step, len(SCALES) - 1)]
+        rows = [_rows(model, v, T, state, scale) for v, T in zip(views, state.poses, strict=True)]
+        delta = _without_fold(state.camera, _solve(rows, _values(state.camera) - begin, free))
+        state = _moved(state, delta, rows, free)
+        if (
+            step >= len(SCALES)
+            and np.sqrt(np.mean([np.mean((r.shared @ delta) ** 2) for r in rows])) < SETTLED
+        ):
+            break
+    rows = [_rows(model, v, T, state, SCALES[-1]) for v, T in zip(views, state.poses, strict=True)]
+    away = _values(state.camera) - begin
+    without = np.stack([_solve([r for r in rows if r is not own], away, free) for own in rows])
+    n = len(rows)
+    spread = (n - 1) / n * (without - without.mean(axis=0)).T @ (without - without.mean(axis=0))
+    pixels = np.concatenate([v.pixels for v in views])
+    return BoardLens(
+        camera=state.camera,
+        model=name,
+        sigma=np.sqrt(np.diag(spread))[:9],
+        rms=_rms(np.array([_left(r, np.zeros(10)) for r in rows])),
+        left_out=np.array([_left(r, d) for r, d in zip(rows, without, strict=True)]),
+        growth=state.growth,
+        coverage=np.ptp(pixels, axis=0) / [start.width, start.height],
+        pixel_sigma=_pixel_sigma(state.camera, spread[:9, :9]),
+        T_camera_board=state.poses,
+    )
+
+
+def _values(camera: Camera) -> Float64:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *(camera.distortion or (0.0,) * 5)])
+
+
+def _camera(values: Float64, like: Camera) -> Camera:
+    fx, fy, cx, cy, *distortion = values.tolist()
+    return Camera(like.width, like.height, fx, fy, cx, cy, tuple(distortion))
+
+
+def _rows(model: Model, view: BoardSeen, T: Float64, state: _State, scale: float) -> _Rows:
+    camera = state.camera
+    rays = camera.rays_at(view.pixels)
+    xy = on_front(T, model.board, rays)
+    edges = model.edges(xy)
+    points = np.column_stack([xy, np.full(len(xy), model.board.thickness)]) @ T[:3, :3].T + T[:3, 3]
+    per_metre = 0.5 * (camera.fx + camera.fy) / points[:, 2]  # pixels
+    residual = edges.distance * per_metre - state.growth
+    gradient = edges.gradient * per_metre[:, None]
+    n = T[:3, 2]
+    across = gradient @ T[:3, :2].T
+    # The ray meets the front elsewhere when the ray or the board moves: the part along the ray keeps the point on the plane.
+    slide = across - ((across * rays).sum(axis=1) / (rays @ n))[:, None] * n
+    own = -np.column_stack([slide, np.cross(points, slide)])
+    values, by_ray = _values(camera), []
+    for k, h in enumerate(STEP):
+        moved = values.copy()
+        moved[k] += h
+        by_ray.append(
+            ((_camera(moved, camera).rays_at(view.pixels) - rays) / h * points[:, 2:] * slide).sum(axis=1)
+        )
+    shared = np.column_stack([*by_ray, -np.ones(len(xy))])
+    good = clear_of_walls(T, model.board, xy, edges.outward) & np.isfinite(residual)
+    weight = np.where(good, tukey_weights(np.nan_to_num(residual), scale), 0.0)
+    return _Rows(shared, own, np.nan_to_num(residual), weight)
+
+
+def _solve(rows: Sequence[_Rows], away: Float64, free: int) -> Float64:
+    """Step (10,) of lens and growth, poses eliminated; what is not free stays."""
+    use = np.r_[np.arange(free), 9]
+    H = np.diag(np.r_[(NOISE / PRIOR) ** 2, 1e-3])
+    g = np.r_[-((NOISE / PRIOR) ** 2) * away, 0.0]
+    for r in rows:
+        A, B, w = r.shared, r.own, r.weight[:, None]
+        gain = (A * w).T @ B @ np.linalg.pinv((B * w).T @ B)
+        H = H + (A * w).T @ A - gain @ ((B * w).T @ A)
+        g = g - (A * w).T @ r.residual + gain @ ((B * w).T @ r.residual)
+    out = np.zeros(10)
+    out[use] = np.linalg.solve(H[np.ix_(use, use)], g[use])
+    return out
+
+
+def _without_fold(camera: Camera, delta: Float64) -> Float64:
+    """A step (10,) of the lens, halved until its image does not fold: far from the answer the first steps go too far.
+
+    Raises
+    ------
+    ConfigError
+        The smallest of them folds, too.
+    """
+    for tried in range(HALVINGS + 1):
+        try:
+            _camera(_values(camera) + delta[:9], camera).rays  # noqa: B018  which inverts the lens at every pixel
+            break
+        except ConfigError:
+            if tried == HALVINGS:
+                raise
+            delta = delta / 2
+    return delta
+
+
+def _pose_step(r: _Rows, delta: Float64) -> Float64:
+    w = r.weight[:, None]
+    out: Float64 = -np.linalg.pinv((r.own * w).T @ r.own) @ ((r.own * w).T @ (r.residual + r.shared @ delta))
+    return out
+
+
+def _moved(state: _State, delta: Float64, rows: Sequence[_Rows], free: int) -> _State:
+    values = _values(state.camera) + np.where(np.arange(9) < free, delta[:9], 0.0)
+    poses = tuple(exp(_pose_step(r, delta)) @ T for r, T in zip(rows, state.poses, strict=True))
+    return _State(_camera(values, state.camera), state.growth + float(delta[9]), poses)
+
+
+def _left(r: _Rows, delta: Float64) -> float:
+    """RMS of a view's rims, its own pose fitted again after the lens has moved by ``delta``."""
+    left = r.residual + r.shared @ delta + r.own @ _pose_step(r, delta)
+    return float(np.sqrt((r.weight * left**2).sum() / max(r.weight.sum(), 1e-9)))
+
+
+def _rms(values: Float64) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _pixel_sigma(camera: Camera, covariance: Float64) -> float:
+    """What the covariance means at the image's edge, once a turn of the camera, which no user sees, is taken off."""
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 7))
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+    rays, values, columns = camera.rays_at(pixels), _values(camera), []
+    for k, h in enumerate(STEP):
+        moved = values.copy()
+        moved[k] += h
+        columns.append(
+            ((_camera(moved, camera).rays_at(pixels) - rays)[:, :2] * [camera.fx, camera.fy] / h).ravel()
+        )
+    J = np.stack(columns, axis=1)
+    turned = np.stack(
+        [
+            (np.cross(axis, rays)[:, :2] - rays[:, :2] * np.cross(axis, rays)[:, 2:]) * [camera.fx, camera.fy]
+            for axis in np.eye(3)
+        ]
+    ).reshape(3, -1)
+    J = J - turned.T @ np.linalg.lstsq(turned.T, J, rcond=None)[0]
+    return float(np.sqrt(np.einsum("ij,jk,ik->i", J, covariance, J).max()))

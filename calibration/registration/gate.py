@@ -1,0 +1,234 @@
+"""What a registration is worth, measured by our own code.
+
+Open3D answers identity for no correspondences, kiss-icp answers the initial guess, small_gicp says ``converged``: no library
+says that it failed. So every result is measured again here against the clouds and passes a gate, or is refused by name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.registration.clouds import Cloud
+from tofcapture.errors import DataError
+from tofcapture.poses import Float64, invert, rotation_angle, transform_points
+
+INLIER_DISTANCE = 0.010  # m; a ToF point this near to a stereo point has found its surface, bias included
+MIN_POINTS = 200  # fewer do not average the noise of a ToF pixel to a tenth
+MIN_FITNESS = 0.3  # share of source points with a partner; the fields of view of a rig overlap by far more
+MAX_CONDITION = 500.0  # a board held by its rims has 3 to 10, a corner below 100, a lone plane thousands
+MAX_ROTATION = np.radians(10.0)  # from the initial guess, which a bracket's drawing gives to 1 or 2 degrees
+MAX_TRANSLATION = 0.10  # m, from the initial guess, at the points
+MAX_STEP_ROTATION = np.radians(0.5)  # one more Newton step of a converged result is far smaller
+MAX_STEP_TRANSLATION = 0.003  # m
+MAX_RMSE = 0.005  # m; below the 5.8 mm of residuals spread evenly over the inlier distance
+
+
+class Refusal(StrEnum):
+    """Why a registration is not believed."""
+
+    EMPTY = "empty"
+    NO_OVERLAP = "no overlap"
+    PLANAR = "planar-degenerate"
+    DIVERGED = "diverged"
+    NOT_CONVERGED = "did not converge"
+    POOR_FIT = "poor fit"
+
+
+@dataclass(frozen=True)
+class Registration:
+    """One measured registration.
+
+    Attributes
+    ----------
+    T_target_source
+        (4, 4), maps source points into the target's frame.
+    inliers
+        Number of source points with a partner within ``INLIER_DISTANCE``.
+    rmse
+        Root mean square point-to-plane distance of the inliers, metres; NaN without inliers.
+    fitness
+        Inliers over source points.
+    information
+        (6, 6) of (translation of ``centre``, rotation about it) in target axes, 1/m^2 and 1/rad^2: ``J^T J / rmse^2``. Its
+        inverse is the covariance that independent residuals would give; bias is not in it.
+    condition
+        Condition number of ``J^T J`` with rotations measured as motion at the inliers' mean radius; infinite when singular.
+    centre
+        (3,) centroid of the inliers, target frame, metres.
+    step
+        (6,) Newton step that is left at this result: (translation of ``centre``, rotation vector), metres and radians.
+    """
+
+    T_target_source: Float64
+    inliers: int
+    rmse: float
+    fitness: float
+    information: Float64
+    condition: float
+    centre: Float64
+    step: Float64
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Point-to-plane residuals of matched points.
+
+    Attributes
+    ----------
+    source
+        (M,) indices into the source points.
+    points, normals
+        (M, 3) moved source points and the normals of their partners, target frame.
+    distance
+        (M,) signed distance of the points to their partners' tangent planes, metres.
+    """
+
+    source: NDArray[np.intp]
+    points: Float64
+    normals: Float64
+    distance: Float64
+
+
+def residuals(source: Float64, target: Cloud, T_target_source: Float64) -> Residuals:
+    """Match every source point with the nearest target point within ``INLIER_DISTANCE``.
+
+    Parameters
+    ----------
+    source
+        (N, 3), source frame, metres.
+    target
+        Cloud with normals.
+    T_target_source
+        (4, 4).
+    """
+    from scipy.spatial import cKDTree
+
+    once, count = runs(source)
+    moved = transform_points(T_target_source, source[once])
+    tree = cKDTree(target.points, balanced_tree=False, compact_nodes=False)
+    distance, partner = tree.query(moved, distance_upper_bound=INLIER_DISTANCE)
+    moved, distance, partner = (np.repeat(x, count, axis=0) for x in (moved, distance, partner))
+    matched = np.flatnonzero(np.isfinite(distance))
+    partner = partner[matched]
+    normals = target.normals[partner]
+    signed = ((moved[matched] - target.points[partner]) * normals).sum(axis=-1)
+    return Residuals(matched, moved[matched], normals, signed)
+
+
+def runs(points: Float64) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Where runs of equal points (N, 3) start, and how long they are: points are repeated to weigh more."""
+    starts = np.flatnonzero(np.concatenate([[True], (points[1:] != points[:-1]).any(axis=1)]))
+    return starts, np.diff(np.append(starts, len(points)))
+
+
+def jacobian(found: Residuals, centre: Float64) -> Float64:
+    """Derivative (M, 6) of the residuals by (translation, rotation about ``centre``), target axes."""
+    return np.concatenate([found.normals, np.cross(found.points - centre, found.normals)], axis=1)
+
+
+def tukey_weights(distance: Float64, scale: float = INLIER_DISTANCE) -> Float64:
+    """Tukey's biweight ``(1 - (r/scale)^2)^2``, zero from ``scale`` on."""
+    out: Float64 = np.square(np.maximum(1 - np.square(distance / scale), 0))
+    return out
+
+
+def check_clouds(source: Float64, target: Cloud) -> Refusal | None:
+    """Say ``EMPTY`` when either side has too few points to register.
+
+    Raises
+    ------
+    DataError
+        When the source is not (N, 3) finite numbers: some libraries drop such rows silently.
+    """
+    if source.ndim != 2 or source.shape[1] != 3 or not np.isfinite(source).all():
+        raise DataError(f"source points: expected finite (N, 3), got shape {source.shape}")
+    return Refusal.EMPTY if min(len(source), len(target)) < MIN_POINTS else None
+
+
+def measure_registration(T_target_source: Float64, source: Float64, target: Cloud) -> Registration:
+    """Measure what a transform achieves between two clouds.
+
+    Parameters
+    ----------
+    T_target_source
+        (4, 4) to judge.
+    source
+        (N, 3), source frame, metres.
+    target
+        Cloud with normals, target frame.
+
+    Returns
+    -------
+    Registration
+        With no inliers, infinite condition and NaN rmse when nothing lies near.
+    """
+    if check_clouds(source, target) is not None:
+        return _nothing(T_target_source)
+    found = residuals(source, target, T_target_source)
+    if len(found.source) < MIN_POINTS:
+        return _nothing(T_target_source, len(found.source), len(found.source) / len(source))
+    centre = found.points.mean(axis=0)
+    J = jacobian(found, centre)
+    weights = tukey_weights(found.distance)[:, None]
+    rmse = float(np.sqrt(np.mean(np.square(found.distance))))
+    radius = float(np.sqrt(np.mean(np.square(found.points - centre).sum(axis=-1))))
+    even = J * np.repeat([1, 1 / radius], 3) / np.sqrt(len(J))
+    eigenvalues = np.linalg.eigvalsh(even.T @ even)
+    condition = float(eigenvalues[-1] / eigenvalues[0]) if eigenvalues[0] > 1e-15 else np.inf
+    normal = (J * weights).T @ J
+    step = -np.linalg.pinv(normal) @ ((J * weights).T @ found.distance)
+    information = J.T @ J / max(rmse, 1e-9) ** 2
+    fitness = len(J) / len(source)
+    return Registration(T_target_source, len(J), rmse, fitness, information, condition, centre, step)
+
+
+def _nothing(T_target_source: Float64, inliers: int = 0, fitness: float = 0.0) -> Registration:
+    centre = T_target_source[:3, 3]
+    return Registration(
+        T_target_source, inliers, np.nan, fitness, np.zeros((6, 6)), np.inf, centre, np.zeros(6)
+    )
+
+
+def check_registration(
+    result: Registration, source: Float64, target: Cloud, initial: Float64
+) -> Refusal | None:
+    """Gate a measured registration.
+
+    Parameters
+    ----------
+    result
+        From :func:`measure_registration`.
+    source, target
+        The clouds it was measured on.
+    initial
+        (4, 4) ``T_target_source`` that the operator believes to about 2 degrees and 2 cm.
+
+    Returns
+    -------
+    Refusal or None
+        The first reason not to believe it, None when it passes.
+    """
+    if check_clouds(source, target) is not None:
+        return Refusal.EMPTY
+    if result.inliers < MIN_POINTS or result.fitness < MIN_FITNESS:
+        return Refusal.NO_OVERLAP
+    if result.condition > MAX_CONDITION:
+        return Refusal.PLANAR
+    if _too_far(result, initial):
+        return Refusal.DIVERGED
+    if (
+        np.linalg.norm(result.step[:3]) > MAX_STEP_TRANSLATION
+        or np.linalg.norm(result.step[3:]) > MAX_STEP_ROTATION
+    ):
+        return Refusal.NOT_CONVERGED
+    return Refusal.POOR_FIT if result.rmse > MAX_RMSE else None
+
+
+def _too_far(result: Registration, initial: Float64) -> bool:
+    moved = result.T_target_source @ invert(initial)
+    shift = transform_points(moved, result.centre) - result.centre
+    return bool(rotation_angle(moved) > MAX_ROTATION or np.linalg.norm(shift) > MAX_TRANSLATION)

@@ -1,0 +1,8 @@
+"""What is looked at: recordings, views, shards, datasets, predictions and calibrations, in Rerun or on a contact sheet.
+
+Each kind of file becomes a :class:`tofcapture.viz.shots.Source` of shots; the Rerun recording and the sheet know shots only.
+"""
+
+from tofcapture.viz.open import open_source
+
+__all__ = ["open_source"]

@@ -1,0 +1,123 @@
+"""What a network reads and what it is held against: batches of frames and of targets."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tofcapture.errors import ConfigError
+
+# m; a decoded depth beyond them is an unwrapping failure on this rig and counts as a hole
+MIN_RANGE, MAX_RANGE = 0.05, 5.0
+
+
+class Frame(NamedTuple):
+    """One ToF frame per batch item, float32.
+
+    Attributes
+    ----------
+    raw
+        (B, K, H, W) raw channels in units of the sensor's saturation value.
+    phasor
+        (B, 4, H, W) I and Q of the low, then of the high frequency, in the same unit.
+    depth
+        (B, 1, H, W) decoded depth (z), metres; holes carry their nearest measured neighbour.
+    valid
+        (B, 1, H, W) 1 where ``depth`` was measured, 0 where it was filled.
+    confidence
+        (B, 1, H, W) amplitude of the high frequency in units of the saturation value.
+    gap
+        (B, 1, H, W) range of the low minus range of the high frequency, metres: the multipath cue.
+    cues
+        (B, 4, H, W) depth errors that physics expects, metres: see :func:`tofcapture_model.networks.multipath.cues`.
+    modulation
+        (B, 2) low and high modulation frequency, Hz.
+    intrinsics
+        (B, 4) fx, fy, cx, cy in pixels of the (H, W) grid, or (B, 9) where there is a lens: :mod:`tofcapture_model.geometry.intrinsics`.
+    demodulation
+        (B, 4, K) weights that turn taps into ``phasor``.
+    """
+
+    raw: Tensor
+    phasor: Tensor
+    depth: Tensor
+    valid: Tensor
+    confidence: Tensor
+    gap: Tensor
+    cues: Tensor
+    modulation: Tensor
+    intrinsics: Tensor
+    demodulation: Tensor
+
+
+NO_MAPS = frozenset({"modulation", "intrinsics", "demodulation"})
+"""Fields of a frame that have no pixels: neither cropped nor mirrored."""
+
+
+class Target(NamedTuple):
+    """Ground truth at twice the resolution.
+
+    Attributes
+    ----------
+    depth
+        (B, 1, 2H, 2W) float32 metres; finite everywhere, meaningless outside ``good`` and ``context``.
+    normals
+        (B, 3, 2H, 2W) float32, unit, facing the camera.
+    good
+        (B, 1, 2H, 2W) bool: no mask bit is set; what metrics are taken over.
+    context
+        (B, 1, 2H, 2W) bool: measured surface outside the object crop; extra supervision, never evaluated.
+    """
+
+    depth: Tensor
+    normals: Tensor
+    good: Tensor
+    context: Tensor
+
+
+class Estimate(NamedTuple):
+    """What a model answers, float32 at twice the resolution.
+
+    Attributes
+    ----------
+    depth, normals
+        (B, 1, 2H, 2W) metres and (B, 3, 2H, 2W) unit camera-facing, after refinement.
+    error
+        (B, 1, 2H, 2W) how far off the depth may be, metres, positive: its expected absolute error where ``losses.uncertainty`` is ``l1`` (paper), one
+        sigma, within which 68 % of the errors should be, where it is ``laplace`` (compact).
+    initial_depth, initial_normals
+        The same before refinement.
+    """
+
+    depth: Tensor
+    normals: Tensor
+    error: Tensor
+    initial_depth: Tensor
+    initial_normals: Tensor
+
+
+def expect_channels(raw: Tensor, channels: int, network: str) -> None:
+    """Say what to do where a network is given another camera's raw channels (B, K, H, W) than it was made for.
+
+    Raises
+    ------
+    ConfigError
+        ``raw`` has not ``channels`` channels.
+    """
+    if raw.shape[1] != channels:
+        raise ConfigError(
+            f"{network}: expected {channels} raw channels, got {raw.shape[1]} from this camera",
+            hint="take the preset compact, which reads phasors, or one of the network's inputs other than raw",
+        )
+
+
+def frame_to(frame: Frame, device: torch.device) -> Frame:
+    """Move a frame to a device."""
+    return Frame(*(x.to(device) for x in frame))
+
+
+def target_to(target: Target, device: torch.device) -> Target:
+    """Move a target to a device."""
+    return Target(*(x.to(device) for x in target))

@@ -1,0 +1,258 @@
+"""Measure the sensor and a model against ground truth; writes ``results.json``."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tofcapture.errors import ConfigError
+from tofcapture.files.manifest import load_manifest
+from tofcapture.files.seal import PARTIAL
+from tofcapture_model.data.frame import Frame, frame_to, target_to
+from tofcapture_model.data.frames import FrameDataset, batched
+from tofcapture_model.data.shards import SampleId
+from tofcapture_model.evaluation.metrics import Score
+from tofcapture_model.networks.baselines import sensor
+from tofcapture_model.networks.joint import JointModel
+from tofcapture_model.networks.zoo import Model
+from tofcapture_model.training.checkpoint import find_model, load_model
+from tofcapture_model.training.learned import not_new, origin, sentence
+
+FORMAT, VERSION = "tofcapture-results", 1
+_EVERY = 7  # of how many good pixels a calibration looks at one
+
+Method = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
+"""Depth (B, 1, 2H, 2W), normals (B, 3, 2H, 2W), and where the method answers by itself."""
+
+
+def model_method(model: Model) -> Method:
+    """Wrap a model as a method; it answers everywhere."""
+
+    def answer(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        estimate = model(frame)
+        return estimate.depth, estimate.normals, torch.isfinite(estimate.depth)
+
+    return answer
+
+
+@torch.no_grad()
+def score(
+    methods: dict[str, Method],
+    dataset: FrameDataset,
+    device: torch.device,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[dict[str, Score], int]:
+    """Run methods over all frames of a dataset.
+
+    Returns
+    -------
+    scores by method, and how many frames were left out because no pixel of their ground truth is good
+    """
+    scores = {name: Score() for name in methods}
+    empty = 0
+    for i, sample in enumerate(dataset.samples):
+        frame = frame_to(batched(dataset.frame(sample)), device)
+        target = target_to(dataset.target(sample), device)
+        empty += int(not target.good.any())
+        for name, method in methods.items():
+            depth, normals, measured = method(frame)
+            scores[name].add(
+                depth, normals, target.depth[None], target.normals[None], target.good[None], measured
+            )
+        if progress:
+            progress(i + 1, len(dataset.samples))
+    return scores, empty
+
+
+ONE_SIGMA = 0.6827  # share of errors within one sigma
+LAPLACE_SIGMA = -math.log(1 - ONE_SIGMA)  # in units of the scale of a Laplace distribution
+
+
+@torch.no_grad()
+def calibrate(model: JointModel, dataset: Path, device: torch.device) -> dict[str, Any]:
+    """Scale the error map of a model so that it holds 68 % of the errors on the first frames of the ``val`` split.
+
+    Without such a split the factor is that of an exact Laplace distribution. The factor is a buffer and goes into checkpoints.
+
+    Returns
+    -------
+    ``factor``, and ``views`` that it was fitted on
+    """
+    if not load_manifest(dataset).split("val"):
+        model.error_map.calibration.mul_(LAPLACE_SIGMA)
+        return {"factor": float(model.error_map.calibration), "views": 0}
+    data = FrameDataset(dataset, "val", frames=1)
+    model.eval()
+    # Twice: the refinement weighs by the error map, so that the depth moves a little with the factor.
+    for _ in range(2):
+        ratios = torch.cat([_ratios(model, data, sample, device) for sample in data.samples])
+        if len(ratios):
+            model.error_map.calibration.mul_(
+                float(ratios.kthvalue(max(int(ONE_SIGMA * len(ratios)), 1)).values)
+            )
+    model.train()
+    data.close()
+    return {"factor": float(model.error_map.calibration), "views": len(data.samples)}
+
+
+def _ratios(model: JointModel, data: FrameDataset, sample: SampleId, device: torch.device) -> Tensor:
+    """Errors in units of the predicted ones at some good pixels of a frame, on the CPU."""
+    found, target = (
+        model(frame_to(batched(data.frame(sample)), device)),
+        target_to(data.target(sample), device),
+    )
+    ratio = (found.depth - target.depth[None]).abs() / found.error.clamp_min(1e-9)
+    kept: Tensor = ratio[target.good[None]][::_EVERY].cpu()
+    return kept
+
+
+def evaluate(
+    dataset: Path,
+    weights: Path | None,
+    out: Path,
+    *,
+    split: str = "test",
+    frames: int = 1,
+    scenes: str = "",
+    device: str = "cpu",
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Evaluate the sensor's own single frame and a model on a split, at twice the sensor's resolution, over mask == 0.
+
+    Parameters
+    ----------
+    dataset
+        Folder with ``manifest.json``.
+    weights
+        Checkpoint; ``None``: the bundled one.
+    out
+        ``results.json``, written atomically.
+    split
+        ``train``, ``val`` or ``test``.
+    frames
+        Frames of every view that are evaluated; 0: all.
+    scenes
+        Only scenes whose name begins so.
+    device
+        Torch device.
+    progress
+        Called with (done, all).
+
+    Returns
+    -------
+    What was written; lengths in metres.
+
+    Raises
+    ------
+    ConfigError
+        ``out`` cannot be written, or no scene of the split begins so.
+    """
+    expect_writable(Path(out))
+    model, config, provenance = load_model(weights)
+    model.to(device)
+    data = FrameDataset(dataset, split, frames=frames)
+    measured = take_scenes(data, split, scenes)
+    methods: dict[str, Method] = {"sensor": sensor.estimate, "model": model_method(model)}
+    scores, empty = score(methods, data, torch.device(device), progress)
+    reader = next(iter(data.readers.values()))
+    results = {
+        "format": FORMAT,
+        "version": VERSION,
+        "dataset": str(dataset),
+        "split": split,
+        "scenes": measured,
+        "views": len({(s.scene, s.view) for s in data.samples}),
+        "frames": len(data.samples),
+        "frames_without_ground_truth": empty,
+        "resolution": [2 * reader.camera.height, 2 * reader.camera.width],
+        "units": "m",
+        "weights": str(find_model(weights)),
+        "network": config.network.kind,
+        "training": origin(provenance),
+        "not_new": not_new_of(provenance, dataset, split, measured),
+        "methods": {name: s.table() for name, s in scores.items()},
+    }
+    data.close()
+    write_results(Path(out), results)
+    return results
+
+
+def expect_writable(path: Path) -> None:
+    """Say before anything is measured that results cannot be written.
+
+    Raises
+    ------
+    ConfigError
+        It names a folder, or there is no right or no room to write.
+    """
+    if path.is_dir():
+        raise ConfigError(f"--out {path}: is a folder", hint=f"--out {path / 'results.json'}")
+    partial = path.with_name(path.name + PARTIAL)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.open("wb").close()
+        partial.unlink()
+    except OSError as err:
+        raise ConfigError(
+            f"--out {path}: cannot be written: {err.strerror}", hint="name a file where you may write"
+        ) from err
+
+
+def take_scenes(data: FrameDataset, split: str, prefix: str) -> list[str]:
+    """Leave only frames of scenes whose name begins so; return the scenes' names, sorted.
+
+    Raises
+    ------
+    ConfigError
+        There is none.
+    """
+    data.samples = [s for s in data.samples if s.scene.startswith(prefix)]
+    if not data.samples:
+        raise ConfigError(
+            f"--scenes {prefix}: no scene of the split {split} begins so", hint=", ".join(data.readers)
+        )
+    return sorted({s.scene for s in data.samples})
+
+
+def not_new_of(
+    provenance: Mapping[str, Any], dataset: Path, split: str, scenes: Collection[str]
+) -> dict[str, str] | None:
+    """Of these scenes of a split those that a network has learned from, as :func:`tofcapture_model.training.learned.not_new` says."""
+    found = not_new(provenance, dataset, split)
+    return None if found is None else {name: why for name, why in found.items() if name in scenes}
+
+
+def write_results(path: Path, results: dict[str, Any]) -> None:
+    """Write ``results.json`` atomically."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + PARTIAL)
+    with partial.open("w", encoding="utf-8") as file:
+        json.dump(results, file, indent=1, allow_nan=False)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def comparison(results: dict[str, Any]) -> str:
+    """Table of the main columns for people, millimetres and degrees."""
+    rows = [
+        f"{'method':8} {'MAE mm':>8} {'median':>8} {'RMSE':>8} {'ABS %':>7} {'normal deg':>11} {'>20 deg %':>10} {'coverage':>9}"
+    ]
+    for name, table in results["methods"].items():
+        d, n = table["depth"]["pixel"], table["normal"]["pixel"]
+        if not d["pixels"]:
+            rows.append(f"{name:8} no pixel with good ground truth")
+            continue
+        rows.append(
+            f"{name:8} {1000 * d['mae']:8.2f} {1000 * d['median']:8.2f} {1000 * d['rmse']:8.2f} {100 * d['abs']:7.2f}"
+            f" {n['mean_deg']:11.2f} {n['paper_bad20_pct']:10.2f} {100 * d['coverage']:8.1f}%"
+        )
+    said = sentence("model", results["not_new"], len(results["scenes"])) if "not_new" in results else ""
+    return "\n".join([*rows, said] if said else rows)

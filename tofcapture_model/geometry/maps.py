@@ -1,0 +1,262 @@
+"""Depth, rays and normals on the image grid, differentiable.
+
+Depth is z in metres, normals are unit and face the camera (``n . p < 0``), images are (B, C, H, W), pixel centres integers, intrinsics
+(B, 4) or, with a lens, (B, 9): :mod:`tofcapture_model.geometry.intrinsics`.
+All functions keep the dtype they are given; the project calls them in float32.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812
+
+from tofcapture.rig import SPEED_OF_LIGHT
+from tofcapture_model.data.frame import Frame
+from tofcapture_model.geometry.intrinsics import PINHOLE, pixel_slopes, rays
+
+_TINY = 1e-12
+_FAINT = 1e-10  # keeps atan2 differentiable where a pixel is dark
+
+
+def unproject(depth: Tensor, intrinsics: Tensor) -> Tensor:
+    """Points (B, 3, H, W) of depth (B, 1, H, W), metres."""
+    return depth * rays(intrinsics, *depth.shape[-2:])
+
+
+def unit(vectors: Tensor) -> Tensor:
+    """Normalise (B, 3, H, W) along the channels; the gradient at zero length is finite."""
+    return vectors / vectors.square().sum(1, keepdim=True).clamp_min(_TINY).sqrt()
+
+
+def shifted(image: Tensor, dy: int, dx: int) -> Tensor:
+    """``out[v, u] = image[v + dy, u + dx]``; beyond the border the border is repeated."""
+    h, w = image.shape[-2:]
+    padded = F.pad(image, (max(-dx, 0), max(dx, 0), max(-dy, 0), max(dy, 0)), mode="replicate")
+    return padded[..., max(dy, 0) : max(dy, 0) + h, max(dx, 0) : max(dx, 0) + w]
+
+
+def doubled_parts(image: Tensor) -> Tensor:
+    """Bilinear x2 (B, C, 4, H, W), the four sub-pixels beside each other: what ``pixel_shuffle`` of (B, 4C, H, W) interleaves."""
+    across = [torch.lerp(image, shifted(image, 0, dx), 0.25) for dx in (-1, 1)]
+    return torch.stack([torch.lerp(a, shifted(a, dy, 0), 0.25) for dy in (-1, 1) for a in across], dim=2)
+
+
+def offsets(radius: int, step: int = 1) -> Iterator[tuple[int, int]]:
+    """Yield the (dy, dx) of a square window without its centre."""
+    reach = range(-radius * step, radius * step + 1, step)
+    return ((dy, dx) for dy in reach for dx in reach if (dy, dx) != (0, 0))
+
+
+def _moment_filters(radius: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """(6, 3, 1, k) along rows and (10, 6, k, 1) along columns: powers of u of each image, then of v of each of those.
+
+    They are made where they are used: a copy from the host would keep a GPU waiting, and cannot be part of a CUDA graph.
+    """
+    r = torch.arange(-radius, radius + 1, dtype=like.dtype, device=like.device)
+    powers = torch.stack([torch.ones_like(r), r, r * r])
+    rows, columns = (
+        torch.block_diag(*(powers[:n] for n in counts))  # type: ignore[no-untyped-call]
+        for counts in ((3, 2, 1), (3, 2, 1, 2, 1, 1))
+    )
+    return rows.reshape(6, 3, 1, -1), columns.reshape(10, 6, -1, 1)
+
+
+@contextmanager
+def _whole_float32(device: torch.device) -> Iterator[None]:
+    """Convolve in float32 all through: moments need more than the 8 bits of mantissa of bfloat16, and than the 11 of TF32 on GPUs."""
+    now = torch.backends.cudnn
+    with (
+        torch.autocast(device.type, enabled=False),
+        now.flags(now.enabled, now.benchmark, now.benchmark_limit, now.deterministic, allow_tf32=False),
+    ):
+        yield
+
+
+def _moments(images: Tensor, radius: int) -> Tensor:
+    """Sums (B, 10, H, W) over every window of images (B, 3, H, W) a, b, c: ``a (1, v, vv, u, uv, uu), b (1, v, u), c``.
+
+    All at once: convolutions of one channel run at a fraction of a processor's speed.
+    """
+    rows, columns = _moment_filters(radius, images)
+    with _whole_float32(images.device):
+        return F.conv2d(F.conv2d(images, rows, padding=(0, radius)), columns, padding=(radius, 0))
+
+
+def local_planes(depth: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """Fit inverse depth linearly in every window (method: ``n . r = 1 / z``, a plane is linear in inverse depth).
+
+    Parameters
+    ----------
+    depth
+        (B, 1, H, W) metres, positive and finite everywhere.
+    valid
+        (B, 1, H, W) weight of every pixel, 0 for holes.
+    radius
+        Window of ``2 radius + 1`` pixels.
+
+    Returns
+    -------
+    coefficients
+        (B, 3, H, W): inverse depth at the window's centre, its slope per pixel in u and in v; 1/m.
+    variance
+        (B, 1, H, W) weighted mean square residual of the fit, 1/m^2.
+    """
+    inverse = 1 / depth
+    origin = inverse.mean(dim=(2, 3), keepdim=True)  # float32 moments cancel badly far from zero
+    i = (inverse - origin) * valid
+    images = torch.cat([valid, i, i * (inverse - origin)], dim=1)
+    s1, sv, svv, su, suv, suu, t1, tv, tu, tt = _moments(images, radius).unbind(1)
+    # a window with one row or column of pixels has a slope of zero across it
+    ridge = 10 * torch.finfo(depth.dtype).eps * suu + _TINY
+    n = s1.clamp_min(_TINY)
+    mu, mv, mi = su / n, sv / n, t1 / n
+    cuu, cvv, cuv = suu - su * mu + ridge, svv - sv * mv + ridge, suv - su * mv
+    cui, cvi = tu - t1 * mu, tv - t1 * mv
+    det = (cuu * cvv - cuv * cuv).clamp_min(_TINY)
+    a, b = (cvv * cui - cuv * cvi) / det, (cuu * cvi - cuv * cui) / det
+    variance = ((tt - t1 * mi - a * cui - b * cvi) / n).clamp_min(0)
+    centre = mi - a * mu - b * mv + origin[:, 0]
+    return torch.stack([centre, a, b], dim=1), variance[:, None]
+
+
+def plane_normals(coefficients: Tensor, intrinsics: Tensor, directions: Tensor | None = None) -> Tensor:
+    """Turn :func:`local_planes` into unit camera-facing normals (B, 3, H, W).
+
+    ``directions`` are the :func:`tofcapture_model.geometry.intrinsics.rays` of the grid, where they are at hand: a lens takes some time to invert.
+    """
+    centre, a, b = coefficients.unbind(1)
+    x, y, _ = (rays(intrinsics, *centre.shape[-2:]) if directions is None else directions).unbind(1)
+    ux, uy, vx, vy = pixel_slopes(intrinsics, x, y)
+    # a window is small beside the bend of a lens: inverse depth is linear in pixels about each one
+    along_x, along_y = (
+        (a * ux, b * vy) if intrinsics.shape[1] == PINHOLE else (a * ux + b * vx, a * uy + b * vy)
+    )
+    outward = torch.stack([along_x, along_y, centre - along_x * x - along_y * y], dim=1)  # n . r = 1/z > 0
+    return -unit(outward)
+
+
+def depth_to_normals(depth: Tensor, valid: Tensor, intrinsics: Tensor, radius: int = 4) -> Tensor:
+    """Normals of a depth map by least squares on inverse depth.
+
+    Parameters
+    ----------
+    depth, valid
+        (B, 1, H, W) metres, and weight of every pixel.
+    intrinsics
+        (B, 4 or 9).
+    radius
+        4 is the 9 x 9 window of GeoNet.
+
+    Returns
+    -------
+    (B, 3, H, W) unit, camera-facing
+    """
+    coefficients, _ = local_planes(depth, valid, radius)
+    return plane_normals(coefficients, intrinsics)
+
+
+def side_window_planes(
+    depth: Tensor, valid: Tensor, radius: int, floor: float = 2e-3
+) -> tuple[Tensor, Tensor]:
+    """Fit planes that do not reach across edges.
+
+    Each pixel is explained by nine windows: the one centred on it and the eight that touch it with a side or a corner;
+    those that fit badly (they hold an edge) count little. It is side-window filtering with planes instead of means.
+
+    Parameters
+    ----------
+    depth, valid
+        As in :func:`local_planes`.
+    radius
+        Of each window.
+    floor
+        Standard deviation, 1/m, below which residuals are equal.
+
+    Returns
+    -------
+    coefficients
+        (B, 3, H, W) as in :func:`local_planes`, at the pixel itself.
+    variance
+        (B, 1, H, W) of the best window.
+    """
+    planes, variance = local_planes(depth, valid, radius)
+    precise = 1 / (variance + floor**2)
+    weight = precise * precise * precise  # a power takes ten times as long
+    weight = weight / weight.amax(dim=(2, 3), keepdim=True)
+    # a window says c + a dx + b dy of the pixel (dx, dy) from its centre; the sum over nine goes along rows, then along columns
+    packed, best = torch.cat([planes * weight, weight], dim=1), variance
+    for slope, step in ((1, (0, radius)), (2, (radius, 0))):
+        before, after = (shifted(packed, way * step[0], way * step[1]) for way in (-1, 1))
+        moved = radius * (before[:, slope] - after[:, slope])[:, None]
+        packed = before + packed + after
+        packed = torch.cat([packed[:, :1] + moved, packed[:, 1:]], dim=1)
+        sides = [shifted(best, way * step[0], way * step[1]) for way in (-1, 1)]
+        best = torch.minimum(best, torch.minimum(*sides))
+    return packed[:, :3] / packed[:, 3:].clamp_min(1e-30), best
+
+
+def propagate_depth(
+    depth: Tensor,
+    normals: Tensor,
+    intrinsics: Tensor,
+    confidence: Tensor,
+    radius: int = 2,
+    step: int = 1,
+    alpha: float = 0.95,
+    max_jump: float = 0.02,
+) -> Tensor:
+    """Move every depth towards the tangent planes of its neighbours (GeoNet's normal-to-depth kernel regression).
+
+    The neighbour j votes ``z_ji = z_j (n_j . r_j) / (n_j . r_i)`` for pixel i with weight ``n_j . n_i`` where that is above
+    ``alpha``; the sign of the normals cancels. Votes further than ``max_jump`` from the present depth are dropped.
+
+    Parameters
+    ----------
+    depth, normals, confidence
+        (B, 1, H, W) metres, (B, 3, H, W) unit, (B, 1, H, W) positive weight of each pixel as a voter.
+    intrinsics
+        (B, 4 or 9).
+    radius, step
+        Window in taps to each side, and pixels between taps.
+    alpha
+        Cosine of the largest angle between normals that vote for each other.
+    max_jump
+        Metres.
+
+    Returns
+    -------
+    (B, 1, H, W) metres
+    """
+    r = rays(intrinsics, *depth.shape[-2:])
+    plane = (normals * r).sum(1, keepdim=True) * depth  # n . p, the plane's distance
+    packed = torch.cat([normals, plane, confidence], dim=1)
+    total, norm = depth * confidence, confidence
+    for dy, dx in offsets(radius, step):
+        other = shifted(packed, dy, dx)
+        n, distance, trust = other[:, :3], other[:, 3:4], other[:, 4:]
+        cosine = (n * normals).sum(1, keepdim=True)
+        slope = (n * r).sum(1, keepdim=True)
+        steep = slope.abs() < 1e-2
+        vote = distance / torch.where(steep, torch.ones_like(slope), slope)
+        keep = (cosine > alpha) & ~steep & ((vote - depth).abs() < max_jump)
+        weight = torch.where(keep, cosine * trust, torch.zeros_like(trust))
+        total = total + weight * torch.where(keep, vote, torch.zeros_like(vote))
+        norm = norm + weight
+    return total / norm
+
+
+def turn(new: Tensor, old: Tensor) -> Tensor:
+    """(B, 1, H, W) radians in [-pi, pi] from phasor ``old`` to phasor ``new``, each (B, 2, H, W) I and Q."""
+    real = (new * old).sum(1, keepdim=True)
+    imaginary = (new[:, 1] * old[:, 0] - new[:, 0] * old[:, 1])[:, None]
+    return torch.atan2(imaginary, real + torch.where(real < 0, -_FAINT, _FAINT))
+
+
+def metres_per_radian(frame: Frame, which: int) -> Tensor:
+    """(B, 1, 1, 1) range per phase of the low (0) or the high (1) frequency."""
+    return (SPEED_OF_LIGHT / (4 * math.pi)) / frame.modulation[:, which].reshape(-1, 1, 1, 1)

@@ -1,0 +1,200 @@
+"""What the physics of light says about the depth error of a frame, before anything is learned.
+
+Four maps in metres, computed from whole frames (crops do not show the rest of the scene): diffuse interreflection, the halo of the
+lens, and the two frequencies' disagreement. Networks read them and learn how far to believe them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812
+
+from tofcapture.rig import SPEED_OF_LIGHT
+from tofcapture_model.geometry.intrinsics import pixel_slopes, rays, thin_intrinsics
+from tofcapture_model.geometry.maps import plane_normals, side_window_planes
+
+SIGNAL = 0.04  # of saturation: amplitude of a white patch that faces the sensor at 1 m; networks correct it by a factor
+STEP = 10  # pixels per patch
+BOUNCES = 3  # the fourth adds less than the first lacks in knowledge
+_WHITEST = 0.9  # albedo
+_FAR = 3.0  # m
+_GRAZING = 0.15  # cosine below which the direct light of a patch says nothing
+_FAINT = 1e-3  # of saturation; below it an amplitude is noise
+
+
+def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: Tensor, hz: float) -> Tensor:
+    """Stack the four maps.
+
+    Parameters
+    ----------
+    phasor
+        (B, 4, H, W) I and Q of the low, then of the high frequency, units of saturation.
+    depth, valid, gap
+        (B, 1, H, W) decoded depth and its weight; range of the low minus range of the high frequency; metres.
+    intrinsics
+        (B, 4 or 9).
+    hz
+        High modulation frequency.
+
+    Returns
+    -------
+    (B, 4, H, W) metres: error by interreflection of what is seen, the same with the scene continued beyond the image, error by the halo if all light were in it, gap averaged over a wide window
+    """
+    high = phasor[:, 2:]
+    amplitude = high.square().sum(1, keepdim=True).sqrt()
+    maps = surface(depth, valid, amplitude, intrinsics)
+    seen = exchange_error(maps, intrinsics, hz)
+    beyond = exchange_error(maps, intrinsics, hz, step=2 * STEP, margin=3)
+    return torch.cat([seen, beyond, halo_error(high, hz), _broad(gap.clamp(-0.3, 0.3), valid)], dim=1)
+
+
+def _broad(image: Tensor, valid: Tensor, shrink: int = 4) -> Tensor:
+    """Mean over some 30 pixels of what is valid, on cells of ``shrink`` pixels."""
+    cells = F.avg_pool2d(
+        torch.cat([image * valid, valid], dim=1), shrink, ceil_mode=True, count_include_pad=False
+    )
+    total, weight = _blur(cells, 2).chunk(2, dim=1)
+    mean = total / weight.clamp_min(1e-3)
+    return F.interpolate(mean, size=image.shape[-2:], mode="bilinear", align_corners=False)
+
+
+def _blur(image: Tensor, radius: int) -> Tensor:
+    """Box mean twice; the border counts what is there."""
+    for _ in range(2):
+        image = F.avg_pool2d(image, 2 * radius + 1, 1, radius, count_include_pad=False)
+    return image
+
+
+def halo_error(phasor: Tensor, hz: float, shrink: int = 6) -> Tensor:
+    """Depth error if the lens scattered all light of the image once over each pixel, to first order.
+
+    A halo adds ``kappa (z * h)`` to the phasor z; the error of a small share kappa is kappa times this map.
+
+    Parameters
+    ----------
+    phasor
+        (B, 2, H, W) I and Q.
+    hz
+        Modulation frequency.
+    shrink
+        Pixels per cell of the blurred image; the halo is blurred over some ten cells.
+
+    Returns
+    -------
+    (B, 1, H, W) metres, within +-1
+    """
+    cells = F.avg_pool2d(phasor, shrink, ceil_mode=True, count_include_pad=False)
+    halo = F.interpolate(_blur(cells, 5), size=phasor.shape[-2:], mode="bilinear", align_corners=False)
+    across = halo[:, 1:] * phasor[:, :1] - halo[:, :1] * phasor[:, 1:]
+    k = 4 * math.pi * hz / SPEED_OF_LIGHT
+    return (across / phasor.square().sum(1, keepdim=True).clamp_min(_FAINT**2) / k).clamp(-1, 1)
+
+
+def surface(depth: Tensor, valid: Tensor, amplitude: Tensor, intrinsics: Tensor) -> Tensor:
+    """Tangent plane and albedo of every pixel (B, 5, H, W): unit normal, ``n . p`` in metres, albedo by the measured amplitude."""
+    planes, _ = side_window_planes(depth, valid + 1e-3, 2)
+    ray = rays(intrinsics, *depth.shape[-2:])
+    normals = plane_normals(planes, intrinsics, ray)
+    smooth = (1 / planes[:, :1].clamp_min(0.1)) * valid + depth * (1 - valid)
+    slope = (normals * ray).sum(1, keepdim=True)  # negative
+    square = ray.square().sum(1, keepdim=True)
+    light = F.avg_pool2d(amplitude, 3, 1, 1, count_include_pad=False) * valid
+    direct = (-slope / square.sqrt()).clamp_min(_GRAZING) / (square * smooth.square())
+    albedo = (light / SIGNAL / direct).clamp_max(_WHITEST)
+    return torch.cat([normals, slope * smooth, albedo], dim=1)
+
+
+def exchange_error(
+    surfaces: Tensor, intrinsics: Tensor, hz: float, step: int = STEP, margin: int = 0
+) -> Tensor:
+    """Estimate the depth error of diffuse interreflection (after Fuchs 2010 and Jimenez 2014, whom the paper names).
+
+    The visible patches are a closed world of Lambertian surfaces: radiosity ``x = rho (E + K x)`` with the sensor's irradiance
+    ``E_p = cos_p / d_p^2 e^{i k d_p / 2}`` and ``K_pq = cos_pq cos_qp / (pi r^2) dS_q e^{i k r / 2}``; albedos come from the
+    measured amplitudes and one constant of the sensor. The error is the angle of ``1 + (K x)_p / E_p``: the albedo of the
+    patch itself cancels.
+
+    Occlusion between patches and what lies out of sight are not in it.
+
+    Parameters
+    ----------
+    surfaces
+        (B, 5, H, W), see :func:`surface`.
+    intrinsics
+        (B, 4 or 9).
+    hz
+        Modulation frequency.
+    step
+        Pixels per patch; time goes with its inverse fourth power.
+    margin
+        Patches that are added beyond each border on the planes of the border, since the table does not end where the image
+        does; right where the scene goes on, too much where it does not.
+
+    Returns
+    -------
+    (B, 1, H, W) metres, positive where things look too far away
+    """
+    size = surfaces.shape[-2:]
+    maps = surfaces[:, :, step // 2 :: step, step // 2 :: step]
+    h, w = maps.shape[-2:]
+    around = F.pad(maps, (margin, margin, margin, margin), mode="replicate")
+    r, density = _patches(thin_intrinsics(intrinsics, step), h, w, margin)
+    found = torch.stack(
+        [
+            _exchange(m.flatten(1), q.flatten(1), d.flatten(), hz)
+            for m, q, d in zip(around, r, density, strict=True)
+        ]
+    )
+    inner = found.reshape(-1, 1, *around.shape[-2:])[..., margin : margin + h, margin : margin + w]
+    return F.interpolate(inner, size=size, mode="bilinear", align_corners=False)
+
+
+def _patches(grid: Tensor, height: int, width: int, margin: int) -> tuple[Tensor, Tensor]:
+    """Rays (B, 3, H, W) of a grid with ``margin`` more pixels at each border, and pixels per unit of the plane z = 1 (B, H, W).
+
+    A lens is known inside its image only, and many fold outside: beyond the border it goes on as it is there, straight.
+    """
+    r = rays(grid, height, width)
+    x, y = r[:, :2].unbind(1)
+    ux, uy, vx, vy = (d.expand_as(x) for d in pixel_slopes(grid, x, y))
+    density = ux * vy - uy * vx
+    border = torch.stack([x, y, density, vy / density, -uy / density, -vx / density, ux / density], dim=1)
+    x, y, density, xu, xv, yu, yv = F.pad(border, (margin,) * 4, mode="replicate").unbind(1)
+    rows, columns = (torch.arange(-margin, n + margin, device=x.device) for n in (height, width))
+    beyond_v, beyond_u = rows - rows.clamp(0, height - 1), columns - columns.clamp(0, width - 1)
+    x = x + xu * beyond_u + xv * beyond_v[:, None]
+    y = y + yu * beyond_u + yv * beyond_v[:, None]
+    return torch.stack([x, y, torch.ones_like(x)], dim=1), density
+
+
+def _exchange(maps: Tensor, r: Tensor, density: Tensor, hz: float) -> Tensor:
+    """Depth error (N,) of patches (5, N): normal, plane distance, albedo; rays (3, N); patches per unit of the plane z = 1 (N,)."""
+    n = maps[:3].T
+    slope = (maps[:3] * r).sum(0).clamp_max(-_GRAZING / 2)
+    z = (maps[3] / slope).clamp(0.1, _FAR)
+    p = (r * z).T
+    k = 4 * math.pi * hz / SPEED_OF_LIGHT  # phase per metre of range, which is half a path
+    distance = p.norm(dim=1)
+    facing = (-(p * n).sum(1) / distance).clamp_min(_GRAZING)
+    # a patch's solid angle is (z / d)^3 / density
+    surface = z.pow(3) / distance / density / facing
+    transfer = _transfer(p, n, surface, k)
+    direct = torch.polar(facing / distance.square(), k * distance / 2)
+    albedo, radiosity = maps[4], maps[4] * direct
+    for _ in range(BOUNCES):
+        indirect = transfer @ radiosity
+        radiosity = albedo * (direct + indirect)
+    return torch.angle(1 + indirect / direct) / k
+
+
+def _transfer(p: Tensor, n: Tensor, surface: Tensor, k: float) -> Tensor:
+    """Irradiance phasor at patch i per radiosity of patch j, complex (N, N): cos cos / (pi r^2) dS_j e^(i k r / 2)."""
+    square = p.square().sum(1)
+    r2 = (square[:, None] + square[None] - 2 * p @ p.T).clamp_min(0) + surface[None]  # a patch is no point
+    own = (n * p).sum(1)
+    towards = (n @ p.T - own[:, None]).clamp_min(0)  # n_i . (p_j - p_i)
+    weight = towards * towards.T / (math.pi * r2.square()) * surface[None]
+    return torch.polar(weight, k / 2 * r2.sqrt())
