@@ -15,12 +15,13 @@ from calibration.alignment.averaged_icp import Average, average_transforms
 from calibration.alignment.diagnosis import check_start, explained
 from calibration.alignment.methods import apply_method, method_named
 from calibration.alignment.range_residual import RangeResidual, fit_range_residual, no_residual
-from calibration.evidence.evidence import evidence_of, write_atomically, write_evidence
+from calibration.evidence.evidence import evidence_of, write_evidence
 from calibration.registration.backends import COARSE_TO_FINE, FINE, backend_named, register
 from calibration.registration.gate import Refusal, Registration, check_registration
 from calibration.registration.pairs import Pair, calibration_views, load_pair
 from calibration.registration.pinned import pinned_worker
 from tofcapture.errors import DataError, QualityError, TofError
+from tofcapture.files.seal import write_text
 from tofcapture.poses import Float64, invert
 from tofcapture.rig import Rig, dumps_rig
 
@@ -130,7 +131,7 @@ def align(
     rig = aligned.rig
     evidence = evidence_of(pairs, solution, backend, start.T_tof_stereo, rig.T_tof_stereo) | aligned.evidence
     write_evidence(recording / "evidence.json", evidence)
-    write_atomically(recording / "rig.toml", dumps_rig(rig))
+    write_text(recording / "rig.toml", dumps_rig(rig))
     return rig, evidence
 
 

@@ -41,7 +41,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> Outcome:
     """Detect the board in every view, solve the bundle, write ``T_flange_tof`` into ``rig.toml`` and ``bundle.json``."""
     from calibration.bundle.solve import ARM_SIGMA, solve_bundle
-    from calibration.evidence.evidence import write_atomically
+    from tofcapture.files.seal import write_text
     from tofcapture.rig import dumps_rig
 
     recording = Path(args.recording)
@@ -49,8 +49,8 @@ def run(args: argparse.Namespace) -> Outcome:
     bundle = solve_bundle(arm, fits, tuple(args.arm_sigma or ARM_SIGMA))
     data = {**report(bundle, fits, rig), "refused": refused}
     if not args.dry_run:
-        write_atomically(recording / "bundle.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
-        write_atomically(recording / "rig.toml", dumps_rig(replace(rig, T_flange_tof=bundle.T_flange_tof)))
+        write_text(recording / "bundle.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
+        write_text(recording / "rig.toml", dumps_rig(replace(rig, T_flange_tof=bundle.T_flange_tof)))
         data |= {"rig": str(recording / "rig.toml")}
     return Outcome(data=data, text=table(data))
 

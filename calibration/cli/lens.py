@@ -42,8 +42,8 @@ def run(args: argparse.Namespace) -> Outcome:
     """Fit the lens, write it into ``rig.toml`` and ``lens.json``."""
     from calibration.board.geometry import load_board
     from calibration.board.model import Model
-    from calibration.evidence.evidence import write_atomically
     from calibration.lens.board import fit_lens_to_board
+    from tofcapture.files.seal import write_text
     from tofcapture.rig import dumps_rig
 
     recording, board = Path(args.recording), load_board(args.board)
@@ -58,8 +58,8 @@ def run(args: argparse.Namespace) -> Outcome:
                 refused, fit = (still, second) if second.rms < WORSE * fit.rms else (refused, fit)
     data = {**report(fit, rig), "refused": refused}
     if not args.dry_run:
-        write_atomically(recording / "lens.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
-        write_atomically(recording / "rig.toml", dumps_rig(replace(rig, tof=fit.camera)))
+        write_text(recording / "lens.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
+        write_text(recording / "rig.toml", dumps_rig(replace(rig, tof=fit.camera)))
         data |= {"rig": str(recording / "rig.toml")}
     return Outcome(data=data, text=table(data))
 

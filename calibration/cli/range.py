@@ -32,9 +32,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Fit the range errors, write them into ``rig.toml`` and ``range.json``."""
-    from calibration.evidence.evidence import write_atomically
     from calibration.range_error.fit import fit_ranges
     from calibration.range_error.report import report, table
+    from tofcapture.files.seal import write_text
     from tofcapture.rig import dumps_rig
 
     recording = Path(args.recording)
@@ -44,9 +44,9 @@ def run(args: argparse.Namespace) -> Outcome:
     fit = fit_ranges(seen, rig.T_tof_stereo, sigma, orders, centre)
     data = report(fit, known)
     if not args.dry_run:
-        write_atomically(recording / "range.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
+        write_text(recording / "range.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
         found = replace(rig, T_tof_stereo=fit.T_tof_stereo, range_errors=fit.errors)
-        write_atomically(recording / "rig.toml", dumps_rig(found))
+        write_text(recording / "rig.toml", dumps_rig(found))
         data |= {"rig": str(recording / "rig.toml")}
     return Outcome(data=data, text=table(data))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from calibration.alignment.range_residual import ORDERS
 from calibration.registration.pairs import Pair
+from tofcapture.files.seal import write_text
 from tofcapture.poses import Float64, invert, rotation_angle, transform_points
 
 if TYPE_CHECKING:
@@ -81,19 +81,9 @@ def alignment_error(T_tof_stereo: Float64, true: Float64) -> tuple[float, float]
     return rotation_angle(T_tof_stereo @ invert(true)), float(np.linalg.norm(moved))
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replace a file by ``text`` such that a reader or a crash sees the old content or the new, never a part."""
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
-
-
 def write_evidence(path: Path, evidence: dict[str, Any]) -> None:
     """Write ``evidence.json``; numbers keep every bit."""
-    write_atomically(path, json.dumps(evidence, indent=1, allow_nan=False) + "\n")
+    write_text(path, json.dumps(evidence, indent=1, allow_nan=False) + "\n")
 
 
 def _degrees_mm(rotation: float, translation: float) -> dict[str, float]:

@@ -151,7 +151,7 @@ def export_mcap(shard: ShardReader, folder: Path, unit: float) -> list[Path]:  #
             f"MCAP needs the library mcap: {err}", hint="pip install 'tofcapture[export]'"
         ) from err
     path = folder / f"{shard.scene}.mcap"
-    with replacing(path) as file:
+    with replacing(path) as partial, partial.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="tofcapture")
         schemas = {

@@ -78,7 +78,7 @@ def export_ply(shard: ShardReader, folder: Path, unit: float) -> list[Path]:  # 
             pose_comment(shard.T_base_tof(view)),
         ]
         path = folder / f"view-{view:03d}.ply"
-        with replacing(path) as file:
-            file.write(ply_bytes(ply_points(shard, view), comments))
+        with replacing(path) as partial:
+            partial.write_bytes(ply_bytes(ply_points(shard, view), comments))
         paths.append(path)
     return paths

@@ -56,8 +56,8 @@ def export_png(shard: ShardReader, folder: Path, unit: float) -> list[Path]:
         }
         for name, image in images.items():
             path = folder / f"{name}-{view:03d}.png"
-            with replacing(path) as file:
-                file.write(png_bytes(image, {} if name == "mask" else {"unit_m": repr(unit)}))
+            with replacing(path) as partial:
+                partial.write_bytes(png_bytes(image, {} if name == "mask" else {"unit_m": repr(unit)}))
             paths.append(path)
     write_text(folder / "cameras.json", json.dumps(_cameras(shard, unit), indent=1) + "\n")
     return [*paths, folder / "cameras.json"]

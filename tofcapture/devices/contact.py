@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture.errors import ConfigError
+from tofcapture.files.seal import write_text
 
 
 def read_contact(path: Path) -> dict[str, Any] | None:
@@ -40,12 +41,10 @@ def write_contact(path: Path, table: Mapping[str, Any]) -> None:
     import tomli_w
 
     text = tomli_w.dumps(table)
-    partial = path.with_name(path.name + ".partial")
     try:
         if path.exists() and path.read_text(encoding="utf-8") == text:
             return
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        write_text(path, text)
     except OSError as err:
         raise ConfigError(
             f"{path}: cannot write what the camera said of itself: {err}",

@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
 
 from tofcapture.errors import DataError
 
@@ -146,12 +145,14 @@ def fsync(path: Path) -> None:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Write a file that takes the place of ``path`` at the end: others see the old one or the new one, also after a power cut."""
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary name to write under; at the end it takes the place of ``path``.
+
+    Others see the old file or the new one, also after a power cut. A file that is not whole leaves nothing.
+    """
     partial = partial_path(path)
     try:
-        with partial.open("wb") as file:
-            yield file
+        yield partial
         fsync(partial)
         partial.replace(path)
         fsync(path.parent)
@@ -161,8 +162,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 def write_text(path: Path, text: str) -> None:
     """Replace a text file atomically, as :func:`replacing` does."""
-    with replacing(path) as file:
-        file.write(text.encode())
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def seal(partial: Path, path: Path) -> str:

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from tofcapture.errors import ConfigError
+from tofcapture.files.seal import replacing
 from tofcapture.poses import Float64, invert
 from tofcapture.rig import Rig
 from tofcapture.viz.colours import limits, paint
-from tofcapture.viz.shots import Shot, Source, whole
+from tofcapture.viz.shots import Shot, Source
 
 _TIMELINE = "view"
 _POINT = 0.0012  # m, radius of a drawn point
@@ -64,7 +65,7 @@ def write_rrd(source: Source, path: Path, most: int, progress: Callable[[int, in
     rr = load_rerun()
     picked = source.spread(most)
     titles = _titles(source.load(picked[0])) if picked else []
-    with whole(path) as partial:
+    with replacing(path) as partial:
         stream = rr.RecordingStream("tofcapture", send_properties=False)
         stream.save(str(partial), default_blueprint=_blueprint(source, titles))
         stream.log("base", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

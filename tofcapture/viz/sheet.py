@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from tofcapture.files.seal import replacing
 from tofcapture.poses import transform_points
 from tofcapture.rig import Rig
 from tofcapture.viz.colours import GOOD, MASK, limits, paint
-from tofcapture.viz.shots import Panel, Shot, Source, whole
+from tofcapture.viz.shots import Panel, Shot, Source
 
 _DPI = 100
 _WIDTH = 12.0  # inches: 1200 pixels
@@ -51,7 +52,7 @@ def write_sheet(source: Source, path: Path, most: int, progress: Callable[[int, 
         _shots(figure, source, shots)
     else:
         _calibration(figure, source)
-    with whole(path) as partial:
+    with replacing(path) as partial:
         figure.savefig(partial, dpi=_DPI, format="png", metadata={"Software": None})
     return len(shots)
 

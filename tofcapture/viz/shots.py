@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.files.seal import partial_path
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig
 
@@ -107,20 +104,3 @@ class Source:
         """Numbers of at most ``most`` shots, spread evenly over all."""
         n = len(self.names)
         return list(range(n)) if n <= most else [round(i) for i in np.linspace(0, n - 1, most)]
-
-
-@contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """Give a temporary name to write under; the file gets its own name when it is whole, and leaves nothing when it is not.
-
-    Parameters
-    ----------
-    path
-        What is to be written; replaced when it exists.
-    """
-    partial = partial_path(path)
-    try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from tofcapture.errors import ConfigError
 from tofcapture.files.manifest import load_manifest
-from tofcapture.files.seal import PARTIAL
+from tofcapture.files.seal import PARTIAL, write_text
 from tofcapture_model.data.frame import Frame, frame_to, target_to
 from tofcapture_model.data.frames import FrameDataset, batched
 from tofcapture_model.data.shards import SampleId
@@ -231,13 +230,7 @@ def not_new_of(
 
 def write_results(path: Path, results: dict[str, Any]) -> None:
     """Write ``results.json`` atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + PARTIAL)
-    with partial.open("w", encoding="utf-8") as file:
-        json.dump(results, file, indent=1, allow_nan=False)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    write_text(path, json.dumps(results, indent=1, allow_nan=False))
 
 
 def comparison(results: dict[str, Any]) -> str:

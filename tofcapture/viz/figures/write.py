@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, get_args
 
 from tofcapture.errors import UsageError
+from tofcapture.files.seal import replacing
 from tofcapture.viz.figures.table import DPI, Kind
-from tofcapture.viz.shots import whole
 
 KINDS: tuple[str, ...] = get_args(Kind)
 METADATA: dict[str, dict[str, None]] = {
@@ -81,7 +81,7 @@ def write_figure(kind: str, path: Path, out: Path, choice: Choice) -> str:
         raise UsageError(f"{out}: expected a name that ends in .png, .pdf or .svg", hint="--out figure.png")
     with _canvas() as figure:
         words = _draw(kind, figure, path, choice)
-        with whole(out) as partial:
+        with replacing(out) as partial:
             packed = {"pil_kwargs": {"compress_level": 9}} if form == "png" else {}
             figure.savefig(partial, dpi=DPI, format=form, metadata=METADATA[form], **packed)
     return words

@@ -1,0 +1,103 @@
+"""What every command shares: progress with the time left, and tables of a fixed form. Both look the same everywhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Protocol
+
+PLAIN_EVERY = 10.0  # s between lines where there is no terminal
+
+
+class Report(Protocol):
+    """Tell how far a task is."""
+
+    def __call__(self, what: str, done: float, total: float, text: str = "", /) -> None:
+        """Show that ``done`` of ``total`` steps of ``what`` are behind us, with a word beside it."""
+
+
+@contextmanager
+def progress() -> Iterator[Report]:
+    """Show progress on stderr for the duration of a command: bars on a terminal, now and then a line elsewhere.
+
+    Yields
+    ------
+    Report
+        One bar per ``what``. The time left counts from what was done at the first call: work found done took no time.
+    """
+    if sys.stderr.isatty():
+        yield from _bars()
+    else:
+        yield _lines()
+
+
+def time_left(seconds: float, fresh: float, left: float) -> str:
+    """Say how long ``left`` steps take when ``fresh`` ones took so many seconds."""
+    if fresh <= 0:
+        return "time left unknown"
+    need = seconds * left / fresh
+    return f"{need / 60:.0f} min left" if need > 90 else f"{need:.0f} s left"
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[object]], indent: str = "") -> str:
+    """Lay rows out under a header: the first column to the left, the others to the right."""
+    cells = [[str(c) for c in row] for row in (header, *rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+    lines = (
+        "  ".join(
+            c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in cells
+    )
+    return "\n".join(f"{indent}{line}".rstrip() for line in lines)
+
+
+def _lines() -> Report:
+    began: dict[str, tuple[float, float]] = {}
+    last = time.monotonic()
+
+    def report(what: str, done: float, total: float, text: str = "", /) -> None:
+        nonlocal last
+        now = time.monotonic()
+        start, before = began.setdefault(what, (now, done))
+        if now - last < PLAIN_EVERY and done < total:
+            return
+        last = now
+        left = f", {time_left(now - start, done - before, total - done)}" if done < total else ""
+        print(f"{what}: {done:g} of {total:g}{left} {text}".rstrip(), file=sys.stderr, flush=True)
+
+    return report
+
+
+def _bars() -> Iterator[Report]:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskID,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("ETA"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[text]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def report(what: str, done: float, total: float, text: str = "", /) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=total, text="")
+            bar.update(tasks[what], completed=done, total=total, text=text)
+
+        yield report
