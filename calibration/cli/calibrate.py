@@ -68,23 +68,23 @@ def _own(module: str) -> tuple[Configure, Run]:
 _PARTS: dict[str, tuple[str, Configure, Run]] = {
     "hand-eye": (
         "where a camera sits on the hand, or beside the arm, from pairs of poses",
-        *_own("hand_eye_cli"),
+        *_own("cli.hand_eye"),
     ),
     "phase-order": (
         "which frequency and phase each channel of unknown raw frames has",
-        *_own("phase_order_cli"),
+        *_own("cli.phase_order"),
     ),
     "bundle": (
         "where both cameras sit on the flange, from the arm's poses and the board in all calibration views",
-        *_own("bundle_cli"),
+        *_own("cli.bundle"),
     ),
     "lens": (
         "the ToF camera's intrinsics and distortion from the board's edges in its own images",
-        *_own("lens_cli"),
+        *_own("cli.lens"),
     ),
     "range": (
         "what the ToF camera measures too long, per frequency, from board views at many distances",
-        *_own("range_cli"),
+        *_own("cli.range"),
     ),
     "board": ("draw the board to print or cut it", _configure_board, _run_board),
     "coverage": (
