@@ -15,8 +15,7 @@ import pytest
 
 from tests.test_dataset_build import simulate, true_rig
 from tofcapture.dataset.build import Share, build_dataset
-from tofcapture.dataset.crew import Crew
-from tofcapture.errors import ConfigError, TofError
+from tofcapture.errors import ConfigError
 from tofcapture.files import shard_writer
 from tofcapture.files.check import check
 from tofcapture.files.seal import sha256_of
@@ -86,30 +85,6 @@ def test_handles_that_somebody_holds_do_not_change_the_bytes(recording, calm, tm
     build_dataset([recording], tmp_path / "out", jobs=1)
     assert held
     assert_same(tmp_path / "out", calm)
-
-
-def test_a_crew_retries_the_dead_one_only():
-    """A task that kills its worker once is done by the next; one that always does is an error; no other is repeated."""
-    suicide = "__import__('os').kill(__import__('os').getpid(), 9)"
-    with Crew(2) as crew:
-        found = dict(crew.run(eval, [("6 * 7",), (suicide,), ("1 / 2",)]))
-        assert (found[0], found[2]) == (42, 0.5)
-        assert isinstance(found[1], TofError)
-        assert "3 times" in found[1].message
-        assert dict(crew.run(eval, [("2 + 2",)])) == {0: 4}
-        with pytest.raises(ZeroDivisionError):
-            list(crew.run(eval, [("1 / 0",)]))
-
-
-def test_a_task_is_tried_again_after_its_worker_died(tmp_path):
-    """The first worker dies with the task in hand, the second finishes it, in the other's stead."""
-    flag = tmp_path / "flag"
-    once = (
-        f"'done' if __import__('os').path.exists({str(flag)!r}) else "
-        f"(open({str(flag)!r}, 'w').close(), __import__('os').kill(__import__('os').getpid(), 9))"
-    )
-    with Crew(1) as crew:
-        assert dict(crew.run(eval, [(once,), ("1",)])) == {0: "done", 1: 1}
 
 
 def test_parts_of_a_batch_make_the_whole(recording, calm, tmp_path):

@@ -1,12 +1,12 @@
-"""Who does the tasks: this process, a crew of processes, or a Dask cluster. The shards do not depend on it."""
+"""Who does the tasks: this process, a pool of processes, or a Dask cluster. The shards do not depend on it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from tofcapture.dataset.crew import RETRIES, Crew
 from tofcapture.dataset.shard_task import SceneOutcome, SceneTask, build_scene
 from tofcapture.errors import ConfigError, DataError, TofError
+from tofcapture.pool import RETRIES, Pool
 
 Progress = Callable[[str, int, int], None]
 """Called with a scene, its views that are finished, its views in all."""
@@ -40,15 +40,15 @@ def run_processes(
     order = sorted(tasks, key=lambda t: (-len(t.views), t.scene))
     whole = len(order) - len(order) % jobs
     out: dict[str, SceneOutcome] = {}
-    with Crew(jobs) as crew:
-        out |= _scenes(crew, order[:whole], progress)
-        out |= {t.scene: build_scene(t, crew, _views(t, progress)) for t in order[whole:]}
+    with Pool(jobs) as pool:
+        out |= _scenes(pool, order[:whole], progress)
+        out |= {t.scene: build_scene(t, pool, _views(t, progress)) for t in order[whole:]}
     return out
 
 
-def _scenes(crew: Crew, tasks: Sequence[SceneTask], progress: Progress | None) -> dict[str, SceneOutcome]:
+def _scenes(pool: Pool, tasks: Sequence[SceneTask], progress: Progress | None) -> dict[str, SceneOutcome]:
     out: dict[str, SceneOutcome] = {}
-    for index, outcome in crew.run(build_scene, [(t,) for t in tasks]):
+    for index, outcome in pool.run(build_scene, [(t,) for t in tasks]):
         task = tasks[index]
         out[task.scene] = SceneOutcome(None, error=outcome) if isinstance(outcome, TofError) else outcome
         if progress:

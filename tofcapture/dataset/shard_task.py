@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture import __version__
-from tofcapture.dataset.crew import Crew, one_thread
 from tofcapture.dataset.sample import SampleConfig, calibrated, make_sample
-from tofcapture.dataset.truth import TruthError, ViewError, pool, view_error
+from tofcapture.dataset.truth import TruthError, ViewError, pooled, view_error
 from tofcapture.errors import DataError, TofError
 from tofcapture.files.hdf import dumps
 from tofcapture.files.layout import SHARD, MaskBit
@@ -36,6 +35,7 @@ from tofcapture.files.shard import Sample, ShardReader
 from tofcapture.files.shard_writer import ShardWriter
 from tofcapture.files.view import read_depth_view
 from tofcapture.frames import View
+from tofcapture.pool import Pool, one_thread
 from tofcapture.rig import Rig, dumps_rig
 
 Made = tuple[Sample, ViewError | None]
@@ -130,15 +130,15 @@ def _made(view: View, depth: NDArray[np.float32], rig: Rig, config: SampleConfig
     return sample, view_error(sample, view)
 
 
-def _samples(task: SceneTask, first: tuple[View, NDArray[np.float32]], crew: Crew | None) -> Iterator[Made]:
-    """Samples in the order of the views, made here or by a crew."""
-    if crew is None:
+def _samples(task: SceneTask, first: tuple[View, NDArray[np.float32]], pool: Pool | None) -> Iterator[Made]:
+    """Samples in the order of the views, made here or by a pool of processes."""
+    if pool is None:
         yield _made(*first, task.rig, task.config)
         yield from (sample_of(path, task.rig, task.config) for path in task.views[1:])
         return
     early: dict[int, Made] = {}
     expected = 0
-    for index, made in crew.run(sample_of, [(path, task.rig, task.config) for path in task.views]):
+    for index, made in pool.run(sample_of, [(path, task.rig, task.config) for path in task.views]):
         if isinstance(made, TofError):
             raise made
         early[index] = made
@@ -178,7 +178,7 @@ def _provenance(
 
 
 def build_shard(
-    task: SceneTask, inputs: tuple[str, ...], crew: Crew | None = None, progress: ViewsDone | None = None
+    task: SceneTask, inputs: tuple[str, ...], pool: Pool | None = None, progress: ViewsDone | None = None
 ) -> str:
     """Make one shard, whole or not at all.
 
@@ -188,7 +188,7 @@ def build_shard(
         What it is made of.
     inputs
         SHA-256 of each view file.
-    crew
+    pool
         Makes samples in parallel; ``None``: here.
     progress
         Told after each view.
@@ -211,7 +211,7 @@ def build_shard(
     with _work_folder(task.path) as work:
         made = work / task.path.name
         with ShardWriter(made, task.scene, task.rig, info, first.stereo.info, len(task.views)) as shard:
-            for path, (sample, error) in zip(task.views, _samples(task, (first, depth), crew), strict=True):
+            for path, (sample, error) in zip(task.views, _samples(task, (first, depth), pool), strict=True):
                 shard.add(sample, path)
                 good.append(int((sample.ground_truth[2].mask == 0).sum()))
                 seen = seen or not (sample.ground_truth[2].mask & MaskBit.NOT_HIT).all()
@@ -223,7 +223,7 @@ def build_shard(
                     f"{task.scene}: stereo measured nothing in the ToF camera's image in any of {len(good)} views",
                     hint="is it the rig of these cameras? tofcapture view shows both",
                 )
-            digest = shard.seal(_provenance(task, inputs, first, good, pool(errors) if errors else None))
+            digest = shard.seal(_provenance(task, inputs, first, good, pooled(errors) if errors else None))
         digest_path(made).replace(digest_path(task.path))  # first: a shard always has its digest
         made.replace(task.path)
     return digest
@@ -242,7 +242,7 @@ def finished(task: SceneTask, inputs: tuple[str, ...]) -> str | None:
 
 
 def build_scene(
-    task: SceneTask, crew: Crew | None = None, progress: ViewsDone | None = None, *, only_look: bool = False
+    task: SceneTask, pool: Pool | None = None, progress: ViewsDone | None = None, *, only_look: bool = False
 ) -> SceneOutcome:
     """Do a task unless its shard is there already; a view that cannot be used is an outcome, not an exception.
 
@@ -250,7 +250,7 @@ def build_scene(
     ----------
     task
         What to do.
-    crew, progress
+    pool, progress
         As for :func:`build_shard`.
     only_look
         Say whether it is there, build nothing.
@@ -261,7 +261,7 @@ def build_scene(
             found = finished(task, inputs)
             if found is not None or only_look:
                 return SceneOutcome(found, skipped=found is not None, peak_memory=peak_memory())
-            return SceneOutcome(build_shard(task, inputs, crew, progress), peak_memory=peak_memory())
+            return SceneOutcome(build_shard(task, inputs, pool, progress), peak_memory=peak_memory())
         except TofError as err:
             return SceneOutcome(None, error=err, peak_memory=peak_memory())
 

@@ -142,7 +142,7 @@ def crop_shares(gt: GroundTruth, truth: Truth) -> CropShares:
     return CropShares(*(int(m.sum()) for m in (target, target & kept, other, other & kept)))
 
 
-def pool(views: list[ViewError]) -> TruthError:
+def pooled(views: list[ViewError]) -> TruthError:
     """Pool the pixels of several views."""
     errors = np.concatenate([v.errors for v in views] or [np.zeros(0, np.float32)])
     target = sum(v.target_pixels for v in views)
@@ -167,7 +167,7 @@ def ground_truth_error(view: View, rig: Rig, config: SampleConfig | None = None)
         raise DataError(
             f"{view.scene} view {view.index}: carries no truth", hint="only simulated recordings do"
         )
-    return pool([error])
+    return pooled([error])
 
 
 def pooled_error(shards: Iterable[Path]) -> TruthError | None:
@@ -178,7 +178,7 @@ def pooled_error(shards: Iterable[Path]) -> TruthError | None:
             gt = shard.provenance.get("gt")
             if gt is not None:
                 errors.append(ViewError(_shard_errors(shard), gt["covered_pixels"], gt["target_pixels"]))
-    return pool(errors) if errors else None
+    return pooled(errors) if errors else None
 
 
 def _shard_errors(shard: ShardReader) -> Float32:
