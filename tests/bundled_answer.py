@@ -1,6 +1,6 @@
 """What the bundled network answers for one made-up frame, as it was when it was measured: ``python -m tests.bundled_answer`` writes it anew.
 
-Only after new weights, or a change of the code that is meant to change answers; docs/tables.md is to be measured again then.
+Only after new weights, or a change of the code that is meant to change answers; benchmarks/RESULTS.md is to be measured again then.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ def test_it_answers_as_when_it_was_measured():
 
 @pytest.mark.slow
 def test_it_beats_the_sensor_by_far_on_the_scenes_that_are_hardest(tmp_path):
-    """Eight views by a camera it has not seen, half of them of hollow bowls and mugs; docs/tables.md has what to expect of others."""
+    """Eight views by a camera it has not seen, half of them of hollow bowls and mugs; benchmarks/RESULTS.md has what to expect of others."""
     out = tmp_path / "data"
     line = ["simulate-dataset", "--seed", "9090", "--scenes", "4", "--views", "2", "--frames", "1"]
     kinds = ["--kinds", "object", "combination", "concave", "corner"]
