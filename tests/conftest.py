@@ -1,8 +1,14 @@
 """Fixtures that more than one file of tests uses."""
 
+import os
 import shutil
 
-import pytest
+# Before numpy and torch are loaded: the tests' algebra is small, several processes share the cores, and idle threads that spin steal them.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import pytest  # noqa: E402
 
 
 @pytest.fixture(scope="module")
