@@ -129,8 +129,8 @@ def shoot(shapes, camera, index, seed, frames):
         time_ns=np.arange(frames),
         tof=TofMaps(
             camera.radial_to_depth(found.radial).astype(np.float32),
-            found.confidence.astype(np.float32),
-            found.saturated,
+            found.amplitude[-1].astype(np.float32),
+            np.zeros(camera.shape, bool),
         ),
         native_depth=np.full((8, 10), np.nan, np.float32),
         ground_truth=gt,

@@ -1,6 +1,8 @@
-"""Register, denoise and crop: what they keep and what they take out."""
+"""Denoise and crop: what they keep and what they take out."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,11 +19,9 @@ from tofcapture.ops.crop import (
     crop_depth,
     dominant_plane,
     find_crop,
-    inside,
-    lowered,
+    refine_clearance,
 )
 from tofcapture.ops.denoise import SPIKE_PIXELS, SPIKE_SIGMAS, STEEPEST, SUPPORT, denoise
-from tofcapture.ops.register import register
 from tofcapture.poses import exp, transform_points
 
 CAMERA = Camera(160, 128, 144.0, 144.0, 79.5, 63.5)
@@ -33,23 +33,18 @@ def rng():
     return np.random.default_rng(0)
 
 
+def inside(crop, points):
+    """The rule of the crop for points (..., 3), in plain numpy."""
+    near = (points[..., 2] > 0) & (points[..., 2] < crop.far)
+    if not np.isfinite(crop.offset):
+        return near
+    height, off = points @ crop.normal - crop.offset, points - crop.centre
+    along = off - (off @ crop.normal)[..., None] * crop.normal
+    return near & (height > crop.clearance) & (np.linalg.norm(along, axis=-1) < crop.radius)
+
+
 def tilted(slope=0.5, distance=0.8):
     return distance / (1 - slope * CAMERA.rays[..., 0])
-
-
-def test_register_transforms_and_keeps_the_grid():
-    """Points move by T_tof_stereo, NaN stays, what is far or behind becomes NaN."""
-    T = exp([0.1, -0.05, 0.02, 0.05, 0.1, -0.03])
-    points = CAMERA.unproject(tilted())
-    points[3, 4] = np.nan
-    points[5, 6] = [0, 0, 9.0]
-    points[7, 8] = [0, 0, -1.0]
-    found = register(points, T, far=2.0)
-    expected = transform_points(T, points)
-    expected[[3, 5, 7], [4, 6, 8]] = np.nan
-    np.testing.assert_allclose(found, expected)
-    with pytest.raises(DataError, match="organised"):
-        register(points.reshape(-1, 3), T, 2.0)
 
 
 @given(st.floats(-1.5, 1.5), st.floats(0.3, 1.5))
@@ -130,7 +125,10 @@ def test_crop_of_another_camera_is_the_same_rule():
     points = transform_points(T, CAMERA.unproject(depth))
     crop = find_crop(points, UP, rng(), radius=0.2)
     flat = Crop(np.array([0.0, 0.0, -1.0]), -0.9, np.array([0, 0, 0.9]), 0.2, 0.001, 2.0)
-    for c in (crop, flat):
+    nothing = find_crop(points, UP, rng(), radius=1e3, far=0.85)
+    bent = replace(CAMERA, distortion=(-0.1, 0.02, 0.001, 0.0, 0.0))
+    assert np.isfinite(crop_depth(flat, depth, bent)).sum() == inside(flat, bent.unproject(depth)).sum() > 0
+    for c in (crop, flat, nothing):
         kept = crop_depth(c, depth, CAMERA, T)
         np.testing.assert_array_equal(np.isfinite(kept), inside(c, points))
         np.testing.assert_array_equal(kept[np.isfinite(kept)], depth[np.isfinite(kept)])
@@ -167,7 +165,7 @@ def test_crop_keeps_what_stands_on_the_table():
     depth[100:110, 70:90] = np.nan
     points = CAMERA.unproject(depth)
     crop = find_crop(points, UP, rng(), radius=0.25)
-    kept = inside(crop, points)
+    kept = np.isfinite(crop_depth(crop, depth, CAMERA))
     expected = np.zeros(CAMERA.shape, dtype=bool)
     expected[50:80, 60:100] = True
     np.testing.assert_array_equal(kept, expected)
@@ -225,11 +223,11 @@ def test_smoothed_points_lower_the_crop_to_their_own_scatter(scatter):
     points = np.random.default_rng(0).normal(0, 1, (4000, 3)) * [0.1, 0.1, scatter] + [0, 0, 1]
     points[:800, 2] -= 0.05  # an object
     crop = Crop(np.array([0, 0, -1.0]), -1.0, np.array([0, 0, 1.0]), 0.35, 0.0012, 2.0)
-    low = lowered(crop, points).clearance
+    low = refine_clearance(crop, points).clearance
     least = min(LOWEST_SMOOTH, max(FINEST, SURE * scatter))
     assert low == pytest.approx(min(0.0012, max(least, 4 * scatter)), rel=0.1)
-    assert lowered(crop, points[:300]) == crop  # too few to tell
-    assert not np.isfinite(lowered(find_crop(points, UP, rng(), 1e3), points).offset)
+    assert refine_clearance(crop, points[:300]) == crop  # too few to tell
+    assert not np.isfinite(refine_clearance(find_crop(points, UP, rng(), 1e3), points).offset)
 
 
 def test_the_same_generator_gives_the_same_crop():

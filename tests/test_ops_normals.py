@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
-from tofcapture.ops.normals import PlaneField, gated_normals, grazing, normals_from_depth
+from tofcapture.ops.normals import PlaneField, grazing, normals_from_depth
 
 CAMERA = Camera(60, 50, 400.0, 405.0, 28.3, 26.1)
 
@@ -35,7 +35,6 @@ def test_planes_are_exact_at_any_tilt(azimuth, tilt):
     v, u = np.nonzero(np.isfinite(depth))
     for found in (
         normals_from_depth(depth, CAMERA)[v, u],
-        gated_normals(depth, CAMERA, radius=2, gate=np.inf)[v, u],
         unit(PlaneField(depth, CAMERA).at(np.stack([u, v], axis=1).astype(float))[0]),
     ):
         there = np.isfinite(found[:, 0])
@@ -65,16 +64,6 @@ def test_missing_depth_has_no_normal_and_spoils_none():
     assert angles(found[21, 20], normal) < 1e-6
     assert np.isnan(normals_from_depth(lonely, CAMERA)).all()
     assert np.isnan(normals_from_depth(np.full(CAMERA.shape, np.nan), CAMERA)).all()
-
-
-def test_gating_ignores_the_other_side_of_an_edge():
-    """Beside a step the gated normals stay exact, the plain ones do not."""
-    normal = np.array([0.0, 0.0, -1.0])
-    depth = plane(CAMERA, normal)
-    depth[:, 30:] *= 1.3
-    assert angles(gated_normals(depth, CAMERA), normal).max() < 1e-6
-    plain = normals_from_depth(depth, CAMERA)[:, 29]
-    assert not angles(plain, normal).max() < 0.05
 
 
 def test_windows_shrink_at_a_crease_and_grow_on_a_plane():
@@ -132,11 +121,14 @@ def test_a_bend_does_not_pull_the_surface():
 
 def test_grazing_by_either_eye():
     """More than 75 degrees from the normal for one of the eyes is grazing; NaN is not."""
-    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [np.nan] * 3])
-    t = np.radians(76)
-    normals = np.array([[0.0, 0.0, -1.0], [np.sin(t), 0.0, -np.cos(t)], [np.nan] * 3])
-    assert grazing(points, normals, [np.zeros(3)]).tolist() == [False, True, False]
-    assert grazing(points, normals, [np.zeros(3), np.array([-8.0, 0.0, 0.0])]).tolist() == [True, True, False]
+    depth, t = np.array([[1.0, 1.0, np.nan]]), np.radians(76)
+    rays = np.broadcast_to([0.0, 0.0, 1.0], (1, 3, 3)).copy()
+    normals = np.array([[[0.0, 0.0, -1.0], [np.sin(t), 0.0, -np.cos(t)], [np.nan] * 3]])
+    out = np.empty((1, 3), dtype=bool)
+    grazing(depth, normals, rays, np.zeros(3), out)
+    assert out.tolist() == [[False, True, False]]
+    grazing(depth, normals, rays, np.array([-8.0, 0.0, 0.0]), out)
+    assert out.tolist() == [[True, True, False]]
 
 
 def test_depth_of_another_shape_is_refused():

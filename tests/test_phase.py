@@ -100,7 +100,7 @@ def test_decode_inverts_encode(distance, seed):
     radial = np.full(CAMERA.shape, distance)
     found = decode(phasors(encode(radial)[order], hz, phases), hz, CAMERA, ILLUMINATOR)
     np.testing.assert_allclose(found.radial, radial, atol=1e-9)
-    np.testing.assert_allclose(found.confidence, 500.0, rtol=1e-9)
+    np.testing.assert_allclose(found.amplitude[-1], 500.0, rtol=1e-9)
 
 
 def test_decode_survives_the_wrap_of_the_high_frequency():

@@ -24,7 +24,7 @@ _INVERTED = 1e-9  # of an image coordinate at z = 1
 
 
 def distorted(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> Float64:
-    """OpenCV's distortion (k1, k2, p1, p2, k3) of coordinates (..., 2) at z = 1."""
+    """Distort coordinates (..., 2) at z = 1 by OpenCV's k1, k2, p1, p2, k3."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -39,7 +39,7 @@ def distorted(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float])
 
 
 def distortion_jacobian(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> Float64:
-    """Derivative (..., 2, 2) of :func:`distorted`."""
+    """Compute the derivative (..., 2, 2) of :func:`distorted`."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -51,7 +51,7 @@ def distortion_jacobian(xy: Float64, coefficients: NDArray[np.floating] | Sequen
 
 
 def undistorted(goal: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> Float64:
-    """Inverse of :func:`distorted` by Newton's method, to 1e-9; NaN stays NaN.
+    """Invert :func:`distorted` by Newton's method, to 1e-9; NaN stays NaN.
 
     Raises
     ------
@@ -65,17 +65,12 @@ def undistorted(goal: Float64, coefficients: NDArray[np.floating] | Sequence[flo
             break
         J = distortion_jacobian(xy, coefficients)
         det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+        du, dv = off[..., 0], off[..., 1]
+        step = np.stack(
+            [J[..., 1, 1] * du - J[..., 0, 1] * dv, J[..., 0, 0] * dv - J[..., 1, 0] * du], axis=-1
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
-            step = (
-                np.stack(
-                    [
-                        J[..., 1, 1] * off[..., 0] - J[..., 0, 1] * off[..., 1],
-                        J[..., 0, 0] * off[..., 1] - J[..., 1, 0] * off[..., 0],
-                    ],
-                    axis=-1,
-                )
-                / det[..., None]
-            )
+            step = step / det[..., None]
         xy = xy - np.clip(np.nan_to_num(step, nan=0.0), -1, 1)
     xy = np.where(np.isnan(goal), np.nan, xy)
     missed = np.nanmax(np.abs(distorted(xy, coefficients) - goal), initial=0.0) > _INVERTED
@@ -88,7 +83,7 @@ def undistorted(goal: Float64, coefficients: NDArray[np.floating] | Sequence[flo
 
 
 def _folds(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> bool:
-    """Whether the image turns over anywhere on the straight way from the axis to the coordinates."""
+    """Tell whether the image turns over anywhere on the straight way from the axis to the coordinates."""
     for share in (0.25, 0.5, 0.75, 1.0):
         J = distortion_jacobian(share * xy, coefficients)
         if (J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0] <= 0).any():
@@ -140,7 +135,7 @@ class Camera:
         return self.height, self.width
 
     def scaled(self, s: int) -> Camera:
-        """Intrinsics of the same view at ``s`` times the resolution: ``f' = s f``, ``c' = s (c + 0.5) - 0.5``."""
+        """Scale the same view to ``s`` times the resolution: ``f' = s f``, ``c' = s (c + 0.5) - 0.5``."""
         return replace(
             self,
             width=self.width * s,
@@ -167,7 +162,7 @@ class Camera:
         return self
 
     def rays_at(self, pixels: NDArray[np.floating]) -> Float64:
-        """Rays (..., 3) with z = 1 through pixel coordinates (..., 2); NaN stays NaN."""
+        """Cast rays (..., 3) with z = 1 through pixel coordinates (..., 2); NaN stays NaN."""
         xy = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         xy = undistorted(xy, self.distortion) if self.distortion else xy
         return np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
@@ -202,18 +197,13 @@ class Camera:
         return out
 
     def unproject(self, depth: NDArray[np.floating]) -> Float64:
-        """Points (..., H, W, 3) of depth (..., H, W), metres; NaN stays NaN."""
+        """Turn depth (..., H, W) into points (..., H, W, 3), metres; NaN stays NaN."""
         if depth.shape[-2:] != self.shape:
             raise ConfigError(f"unproject: expected depth of {self.shape}, got {depth.shape}")
         return np.asarray(depth, dtype=np.float64)[..., None] * self.rays
 
     def project(self, points: NDArray[np.floating]) -> tuple[Float64, Float64]:
-        """Pixel coordinates of points.
-
-        Parameters
-        ----------
-        points
-            (..., 3), camera frame, metres.
+        """Project points (..., 3), camera frame, metres.
 
         Returns
         -------
@@ -238,9 +228,9 @@ class Camera:
         return out
 
     def depth_to_radial(self, depth: NDArray[np.floating]) -> Float64:
-        """Distance along the ray of a depth image (..., H, W)."""
+        """Turn depth (..., H, W) into distance along the ray."""
         return np.asarray(depth, dtype=np.float64) * self.ray_lengths
 
     def radial_to_depth(self, radial: NDArray[np.floating]) -> Float64:
-        """Depth of a radial image (..., H, W)."""
+        """Turn distance along the ray (..., H, W) into depth."""
         return np.asarray(radial, dtype=np.float64) / self.ray_lengths

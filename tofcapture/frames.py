@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import IntFlag
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,25 @@ from tofcapture.rig import RangeError, Rig
 
 PAPER_MODULATION_HZ = (20e6,) * 4 + (100e6,) * 4
 PAPER_PHASE_RAD = tuple(float(k) * np.pi / 2 for k in range(4)) * 2
+CALIBRATION = "calibration"
+"""Name of the scene that is the calibration board."""
+
+
+class TofFlag(IntFlag):
+    """Why a decoded ToF pixel should not be trusted; 0 is a good pixel. :data:`TOF_FLAG_DOCS` says what each means."""
+
+    SATURATED = 1
+    FLYING = 2
+    LOW_CONFIDENCE = 4
+    AMBIGUOUS = 8
+
+
+TOF_FLAG_DOCS = {
+    TofFlag.SATURATED: "a tap of a frame reached saturation; there is no depth",
+    TofFlag.FLYING: "on both sides of it, in a row or a column, depth jumps by more than a surface at 80 degrees: a mixed pixel",
+    TofFlag.LOW_CONFIDENCE: "shot and read noise make the depth uncertain by more than 20 mm (one standard deviation)",
+    TofFlag.AMBIGUOUS: "the two frequencies disagree by more than a quarter of the high one's wrap: its number may be wrong",
+}
 
 
 @dataclass(frozen=True)

@@ -18,18 +18,7 @@ _SMALL = 1e-6  # rad; below this the Taylor series of the rotation formulas is e
 
 
 def check_transform(T: ArrayLike, name: str = "transform") -> Float64:
-    """Coerce to a rigid (4, 4) float64 transform, or say what is wrong with it.
-
-    Parameters
-    ----------
-    T
-        Array-like, shape (4, 4), metres.
-    name
-        What to call it in the message.
-
-    Returns
-    -------
-    (4, 4) float64
+    """Coerce to a rigid (4, 4) float64 transform, or say what is wrong with it; ``name`` is what to call it then.
 
     Raises
     ------
@@ -88,7 +77,7 @@ def hat(v: ArrayLike) -> Float64:
 
 
 def rotation_exp(phi: ArrayLike) -> Float64:
-    """Rodrigues' formula: rotation vector (3,) in radians to a (3, 3) rotation."""
+    """Turn a rotation vector (3,), radians, into a (3, 3) rotation by Rodrigues' formula."""
     phi = np.asarray(phi, dtype=np.float64)
     angle = float(np.linalg.norm(phi))
     K = hat(phi)
@@ -99,7 +88,7 @@ def rotation_exp(phi: ArrayLike) -> Float64:
 
 
 def rotation_log(R: Float64) -> Float64:
-    """Inverse of :func:`rotation_exp`, angle in [0, pi], exact near 0 and near pi."""
+    """Invert :func:`rotation_exp`: angle in [0, pi], exact near 0 and near pi."""
     w = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
     sine = float(np.linalg.norm(w))
     cosine = float((np.trace(R) - 1) / 2)
@@ -117,12 +106,12 @@ def rotation_log(R: Float64) -> Float64:
 
 
 def rotation_angle(R: Float64) -> float:
-    """Angle of a rotation (3, 3) or of a transform's rotation, in radians."""
+    """Measure the angle of a rotation (3, 3) or of a transform's rotation, radians."""
     return float(np.linalg.norm(rotation_log(R[:3, :3])))
 
 
 def exp(xi: ArrayLike) -> Float64:
-    """Exponential of a twist (6,): metres, then radians."""
+    """Turn a twist (6,), metres, then radians, into a transform."""
     xi = np.asarray(xi, dtype=np.float64)
     rho, phi = xi[:3], xi[3:]
     angle = float(np.linalg.norm(phi))
@@ -135,7 +124,7 @@ def exp(xi: ArrayLike) -> Float64:
 
 
 def log(T: Float64) -> Float64:
-    """Inverse of :func:`exp`: transform to twist (6,)."""
+    """Invert :func:`exp`: transform to twist (6,)."""
     phi = rotation_log(T[:3, :3])
     angle = float(np.linalg.norm(phi))
     K = hat(phi)
@@ -148,12 +137,10 @@ def log(T: Float64) -> Float64:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), roll: float = 0.0) -> Float64:
-    """Pose of a camera (x right, y down, z forward) at ``eye`` that looks at ``target``.
+    """Pose a camera (x right, y down, z forward) at ``eye`` (3,) so that it looks at ``target`` (3,), metres.
 
     Parameters
     ----------
-    eye, target
-        Points (3,) of the world, metres.
     up
         World direction that should appear upwards; replaced by world x when the view is parallel to it.
     roll

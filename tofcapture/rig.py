@@ -1,7 +1,4 @@
-"""The calibrated constants of a rig and their TOML file, ``rig.toml``.
-
-A rig is a ToF camera and a stereo camera, rigid on the arm's flange.
-"""
+"""The calibrated constants of a rig, two cameras rigid on the arm's flange, and their TOML file ``rig.toml``."""
 
 from __future__ import annotations
 
@@ -33,10 +30,8 @@ class RangeError:
     ----------
     modulation_hz
         The frequency it belongs to.
-    offset
-        Metres.
-    scale
-        Metres per metre.
+    offset, scale
+        Metres, metres per metre.
     harmonics
         ``(m, a_m, b_m)``: order, cosine and sine amplitude in metres ("wiggling").
     per_pixel_radius
@@ -67,20 +62,16 @@ class RangeError:
         place: NDArray[np.floating] | None = None,
         amplitude: NDArray[np.floating] | None = None,
     ) -> Float64:
-        """Error in metres.
+        """Compute the error, metres.
 
         Parameters
         ----------
         phase
             Any shape, radians, of the modulation at this frequency; unwrapped where a scale term matters.
-        radius_px
-            Broadcastable to ``phase``: distance to the principal point in pixels.
-        celsius
-            Sensor temperature.
-        place
-            (..., 2) x and y of :func:`image_places`; needed where there are ``image`` terms.
-        amplitude
-            Raw units, broadcastable to ``phase``; needed where there is ``per_inverse_amplitude``.
+        radius_px, celsius
+            Distance to the principal point, broadcastable to ``phase``; sensor temperature.
+        place, amplitude
+            (..., 2) of :func:`image_places`, and raw units; needed where there are ``image`` terms, or ``per_inverse_amplitude``.
 
         Raises
         ------
@@ -97,10 +88,9 @@ class RangeError:
         return out
 
     def pixels(self, camera: Camera) -> Float64:
-        """(H, W) metres: the part that depends on the pixel alone, offset included."""
-        v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-        radius = np.hypot(u - camera.cx, v - camera.cy)
-        out: Float64 = self.offset + self.per_pixel_radius * radius + self._of_place(image_places(camera))
+        """Compute the part that depends on the pixel alone, offset included: (H, W) metres."""
+        fixed = self.offset + self.per_pixel_radius * radius_px(camera)
+        out: Float64 = fixed + self._of_place(image_places(camera))
         return out
 
     def _of_place(self, place: NDArray[np.floating] | None) -> Float64 | float:
@@ -122,8 +112,15 @@ class RangeError:
         return np.divide(self.per_inverse_amplitude, A, out=np.zeros_like(A), where=A > 0)
 
 
+def radius_px(camera: Camera) -> Float64:
+    """Measure the distance (H, W) of each pixel to the principal point, pixels."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    out: Float64 = np.hypot(u - camera.cx, v - camera.cy)
+    return out
+
+
 def image_places(camera: Camera) -> Float64:
-    """(H, W, 2) x and y of every pixel, -1 to 1 from the first pixel's centre to the last one's."""
+    """Place every pixel (H, W, 2) in x and y, -1 to 1 from the first pixel's centre to the last one's."""
     x, y = (np.linspace(-1, 1, n) if n > 1 else np.zeros(1) for n in (camera.width, camera.height))
     out: Float64 = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1)
     return out
@@ -161,12 +158,12 @@ class Rig:
 
     @property
     def T_stereo_tof(self) -> Float64:
-        """(4, 4) ToF frame to stereo frame."""
+        """Map the ToF frame to the stereo frame: (4, 4)."""
         return invert(self.T_tof_stereo)
 
     @property
     def T_flange_stereo(self) -> Float64:
-        """(4, 4) stereo frame to flange frame."""
+        """Map the stereo frame to the flange frame: (4, 4)."""
         return self.T_flange_tof @ self.T_tof_stereo
 
 

@@ -18,19 +18,17 @@ from tofcapture.files.info import tof_from, tof_table
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, TofMaps
 from tofcapture.frames import TofBurst, TofInfo, View
-from tofcapture.ops.crop import Crop, crop_depth, find_crop, lowered
+from tofcapture.ops.crop import Crop, crop_depth, find_crop, refine_clearance
 from tofcapture.ops.denoise import denoise
-from tofcapture.ops.normals import GRAZING_COSINE, PlaneField
+from tofcapture.ops.normals import PlaneField, grazing
 from tofcapture.ops.phase import Decoder
 from tofcapture.ops.project import Projection, project, triangulate
-from tofcapture.ops.register import register
-from tofcapture.poses import Float64
+from tofcapture.poses import Float64, transform_points
 from tofcapture.rig import Rig
 
 SCALES = (1, 2)  # always there
 FINEST = (*SCALES, 4)
 SPARSE = 4  # pixels of the stereo grid between points that vote for the table
-WITHIN = 4.0  # standard deviations by which a triangle may miss the plane through its surroundings
 
 
 @dataclass(frozen=True)
@@ -106,9 +104,7 @@ def make_sample(
     native = np.where(denoise(measured, rig.stereo), measured, np.float32(np.nan))
     sheet = triangulate(native, rig.stereo)
     field = PlaneField(np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
-    crop = find_crop(
-        _sparse_points(native, rig, config.far), T_base_tof[2, :3], rng, config.crop_radius, config.far
-    )
+    crop = find_crop(_sparse_points(native, rig), T_base_tof[2, :3], rng, config.crop_radius, config.far)
     truths = {}
     for scale in config.scales:
         camera = rig.tof.scaled(scale)
@@ -160,52 +156,33 @@ def _decoder(info: str, thread: int) -> Decoder:  # noqa: ARG001  a decoder's bu
     return Decoder(tof_from(json.loads(info), "tof_info"))
 
 
-def _sparse_points(native: NDArray[np.float32], rig: Rig, far: float) -> Float64:
+def _sparse_points(native: NDArray[np.float32], rig: Rig) -> Float64:
     """Every fourth stereo point of every fourth row, ToF frame: enough to find a table."""
     points = native[::SPARSE, ::SPARSE, None] * rig.stereo.rays[::SPARSE, ::SPARSE]
-    return register(points, rig.T_tof_stereo, far)
+    return transform_points(rig.T_tof_stereo, points)
 
 
 def smoothed(projection: Projection, field: PlaneField, rig: Rig, camera: Camera) -> Projection:
-    """Depth and normals of the planes that fit the surface where it is flat but for noise.
-
-    A ray's triangle is as noisy as three points; where the plane through the window about it is as good as planes here are,
-    and passes the triangle within the points' noise, the ray is intersected with that plane. Normals are those of the best
-    plane that faces the camera, a triangle's own where none does.
-    """
-    from tofcapture.ops.kernels.pixels import refine
-
-    planes, residuals = field.at(projection.pixels.reshape(-1, 2))
-    depth, normals = projection.depth.copy(), projection.normals.copy()
-    rays = camera.rays.reshape(-1, 3)
-    refine(planes, residuals, rig.T_tof_stereo, rays, WITHIN, depth.reshape(-1), normals.reshape(-1, 3))
+    """Take depth and normals of the planes that fit the surface where it is flat but for noise."""
+    depth, normals = field.smooth(
+        projection.depth, projection.normals, projection.pixels, camera, rig.T_tof_stereo
+    )
     return replace(projection, depth=depth, normals=normals)
 
 
 def assemble(projection: Projection, rig: Rig, camera: Camera, crop: Crop) -> GroundTruth:
     """Put every reason for mistrust into the bits of one mask; where nothing is cropped, nothing is OUTSIDE."""
-    from tofcapture.ops.kernels.pixels import judge
-
     some = projection.depth[::SPARSE, ::SPARSE, None] * camera.rays[::SPARSE, ::SPARSE]
-    crop = lowered(crop, some[~projection.edge[::SPARSE, ::SPARSE]])
-    outside = MaskBit.OUTSIDE if np.isfinite(crop.offset) else 0
+    crop = refine_clearance(crop, some[~projection.edge[::SPARSE, ::SPARSE]])
+    slanted = np.empty(camera.shape, dtype=bool)
+    grazing(projection.depth, projection.normals, camera.rays, rig.T_tof_stereo[:3, 3].copy(), slanted)
     mask = np.zeros(camera.shape, dtype=np.uint8)
     for bit, where in (
         (MaskBit.NOT_HIT, np.isnan(projection.depth)),
         (MaskBit.OCCLUDED, projection.occluded),
         (MaskBit.EDGE, projection.edge),
+        (MaskBit.GRAZING, slanted),
+        (MaskBit.OUTSIDE, np.isfinite(crop.offset) & np.isnan(crop_depth(crop, projection.depth, camera))),
     ):
         mask |= where * np.uint8(bit)
-    judge(
-        projection.depth,
-        projection.normals,
-        camera.rays,
-        rig.T_tof_stereo[:3, 3].copy(),
-        GRAZING_COSINE,
-        np.append(crop.normal, crop.offset),
-        crop.centre,
-        np.array([crop.clearance, crop.radius, crop.far]),
-        (int(MaskBit.GRAZING), int(outside)),
-        mask,
-    )
     return GroundTruth(projection.depth.astype(np.float32), projection.normals.astype(np.float32), mask)

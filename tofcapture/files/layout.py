@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import IntFlag
 
-from tofcapture.flags import TOF_FLAG_DOCS, TofFlag
+from tofcapture.frames import TOF_FLAG_DOCS, TofFlag
 
 __all__ = [
     "BOARD_SCENE",

@@ -45,7 +45,7 @@ class TofMaps:
     confidence
         (H, W) float32, amplitude of the highest frequency, raw units.
     flags
-        (H, W) uint8, bits of :class:`tofcapture.flags.TofFlag`; 0 is a good pixel. An array of bool says which are saturated.
+        (H, W) uint8, bits of :class:`tofcapture.frames.TofFlag`; 0 is a good pixel. An array of bool says which are saturated.
     """
 
     depth: Float32

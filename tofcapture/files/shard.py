@@ -194,7 +194,7 @@ class ShardReader:
         return TofMaps(self._row("tof/depth", view), self._row("tof/confidence", view), self.flags(view))
 
     def flags(self, view: int) -> NDArray[np.uint8]:
-        """(H, W) uint8, bits of :class:`tofcapture.flags.TofFlag`; a shard of version 1 knows of saturation only."""
+        """(H, W) uint8, bits of :class:`tofcapture.frames.TofFlag`; a shard of version 1 knows of saturation only."""
         name = "tof/flags" if self.version > SHARD_1.version else "tof/saturated"
         return self._row(name, view).astype(np.uint8, copy=False)
 

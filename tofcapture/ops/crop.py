@@ -1,7 +1,7 @@
-"""Find the table and say what stands on it.
+"""Find the table and keep what stands on it.
 
-The table is the dominant plane, or a parallel one below it: from close by, the flat top of an object may fill more of the view
-than the table does. The scene's object is what stands above the table, not far from where the camera looks.
+The table is the dominant plane, or a parallel one below it: from close by, an object's flat top may fill more of the view.
+The scene's object is what stands above the table, not far from where the camera looks.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
+from tofcapture.compiled import compiled
 from tofcapture.poses import Float64
-
-Bool = NDArray[np.bool_]
 
 TRIALS = 1000  # finds a plane of a fifth of the points but for 3 in 10 000
 LEVEL_TRIALS = 8000  # finds a plane of a twelfth of the points but for 1 in 100
@@ -66,7 +65,7 @@ class Crop:
 
 
 def _plane_of(points: Float64) -> tuple[Float64, float]:
-    """Least-squares plane of (N, 3) points, its normal towards the origin's side."""
+    """Fit a plane to (N, 3) points, its normal towards the origin."""
     mean = points.mean(axis=0)
     normal = np.linalg.eigh(np.cov((points - mean).T))[1][:, 0]
     normal = normal if normal @ mean < 0 else -normal
@@ -74,7 +73,7 @@ def _plane_of(points: Float64) -> tuple[Float64, float]:
 
 
 def _candidates(points: Float64, rng: np.random.Generator, trials: int) -> tuple[Float64, Float64]:
-    """Planes (T, 3), (T,) through random triples."""
+    """Draw planes (T, 3), (T,) through random triples."""
     a, b, c = np.moveaxis(points[rng.integers(0, len(points), (trials, 3))], 1, 0)
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
@@ -203,7 +202,7 @@ def find_crop(
     return Crop(normal, offset, axis, radius, max(LOWEST, ABOVE * rms), far)
 
 
-def lowered(crop: Crop, points: NDArray[np.floating]) -> Crop:
+def refine_clearance(crop: Crop, points: NDArray[np.floating]) -> Crop:
     """Lower a crop's clearance to what smoothed points allow: foreground begins where the table's own scatter ends.
 
     Parameters
@@ -216,8 +215,8 @@ def lowered(crop: Crop, points: NDArray[np.floating]) -> Crop:
     Returns
     -------
     Crop
-        The same with a clearance of four standard deviations (1.48 MAD) of the points that the crop takes for table, at least
-        a quarter of a millimetre or, from close by, twelve of them; never more than before.
+        With a clearance of four standard deviations (1.48 MAD) of the points that the crop takes for table: at least a
+        quarter of a millimetre or, from close by, twelve of them, and never more than before.
     """
     if not np.isfinite(crop.offset):
         return crop
@@ -232,39 +231,44 @@ def lowered(crop: Crop, points: NDArray[np.floating]) -> Crop:
     return replace(crop, clearance=min(crop.clearance, clearance))
 
 
-def inside(crop: Crop, points: NDArray[np.floating]) -> Bool:
-    """Say which points (..., 3) belong to the scene's object; NaN points do not.
-
-    Parameters
-    ----------
-    crop
-        From :func:`find_crop`.
-    points
-        ToF frame, metres.
-    """
-    points = np.asarray(points, dtype=np.float64)
-    near: Bool = (points[..., 2] > 0) & (points[..., 2] < crop.far)
-    if not np.isfinite(crop.offset):
-        return near
-    height = points @ crop.normal - crop.offset
-    along = (points - crop.centre) - ((points - crop.centre) @ crop.normal)[..., None] * crop.normal
-    out: Bool = near & (height > crop.clearance) & (np.linalg.norm(along, axis=-1) < crop.radius)
-    return out
-
-
 def crop_depth(
-    crop: Crop, depth: NDArray[np.float32], camera: Camera, T_tof_camera: Float64
-) -> NDArray[np.float32]:
-    """Keep the depths (H, W) of another camera whose points are inside; the others become NaN.
+    crop: Crop, depth: NDArray[np.floating], camera: Camera, T_tof_camera: Float64 | None = None
+) -> NDArray[np.floating]:
+    """Keep the depths (H, W) of a camera whose points belong to the scene's object; the others become NaN.
 
-    The same rule as :func:`inside`, without the points ever being held in memory.
+    ``T_tof_camera`` (4, 4) is where that camera stands; ``None``: it is the ToF camera. The result has depth's dtype.
     """
-    from tofcapture.ops.kernels.crop import above
-
-    out = np.empty(depth.shape, np.float32)
+    depth, rays = np.ascontiguousarray(depth), camera.rays
+    x, y = rays[..., 0], rays[..., 1]
+    if not camera.distortion:  # a row and a column tell all: the image of rays need not be read
+        x, y = np.broadcast_to(x[:1], depth.shape), np.broadcast_to(y[:, :1], depth.shape)
+    out = np.empty_like(depth)
+    pose = np.eye(4) if T_tof_camera is None else T_tof_camera
     limits = np.array([crop.clearance, crop.radius, crop.far])
-    rays = camera.pinhole("stereo depth").rays
-    x, y = rays[0, :, 0].copy(), rays[:, 0, 1].copy()
-    plane = np.append(crop.normal, crop.offset)
-    above(depth, x, y, plane, crop.centre, limits, T_tof_camera, out)
+    _keep(depth, x, y, np.append(crop.normal, crop.offset), crop.centre, limits, pose, out)
     return out
+
+
+@compiled
+def _keep(
+    z: NDArray[np.floating], x: Float64, y: Float64, plane: Float64, centre: Float64, limits: Float64,
+    pose: Float64, out: NDArray[np.floating],
+) -> None:  # fmt: skip
+    """Keep depths over a table and near its centre; ``x`` and ``y`` (H, W) are rays, a NaN offset keeps all within far.
+
+    ``plane`` (4,) is normal and offset, ``limits`` clearance, radius and far, in the frame that ``pose`` maps to.
+    """
+    p = np.empty(3)
+    for v in range(z.shape[0]):
+        for u in range(z.shape[1]):
+            out[v, u] = np.nan
+            for k in range(3):
+                p[k] = z[v, u] * (pose[k, 0] * x[v, u] + pose[k, 1] * y[v, u] + pose[k, 2]) + pose[k, 3]
+            if not 0 < p[2] < limits[2]:
+                continue
+            height = plane[0] * p[0] + plane[1] * p[1] + plane[2] * p[2] - plane[3]
+            dx, dy, dz = p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]
+            along = plane[0] * dx + plane[1] * dy + plane[2] * dz
+            near = dx * dx + dy * dy + dz * dz - along * along < limits[1] ** 2
+            if not np.isfinite(plane[3]) or (height > limits[0] and near):
+                out[v, u] = z[v, u]

@@ -1,8 +1,8 @@
 """Normals of depth images: planes fitted to inverse depth over pixel rays.
 
 A plane ``n . p = d`` seen along the ray ``r`` (z = 1) at depth z obeys ``m . r = 1 / z`` with ``m = n / d``: a linear
-least-squares fit of inverse depth over rays (method.md 2.1). Its regressors carry no noise, unlike those of a fit to points,
-and without gating its sums are box filters.
+least-squares fit of inverse depth over rays (method.md 2.1), whose regressors carry no noise. :func:`normals_from_depth` is
+numpy alone, for readers; :class:`PlaneField` is compiled, and lets every place have its own window.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
+from tofcapture.compiled import compiled
 from tofcapture.errors import DataError
 
 Float64 = NDArray[np.float64]
@@ -22,6 +23,8 @@ RADII = (2, 4, 8, 12)  # pixels, windows that PlaneField chooses from
 TOLERANCE = 2.0  # a window is flat while its residual is below this many times the median of such windows
 TYPICAL = 4000  # windows, at least, whose median is taken
 GRAZING_COSINE = 0.25882  # cos 75 deg
+WITHIN = 4.0  # standard deviations by which a triangle may miss the plane through its surroundings
+CELL = 2  # pixels: windows start and end at cells, a quarter of the table's memory and of its cache misses
 _MIN_SPREAD = 1e-4  # det / trace^2 of the window's rays; below, they are a line and the plane may swivel
 
 
@@ -82,7 +85,7 @@ def _facing(normals: Float64, rays: Float64, depth: NDArray[np.floating]) -> Flo
 def normals_from_depth(depth: NDArray[np.floating], camera: Camera, radius: int = 4) -> Float64:
     """Fit a plane to each pixel's window.
 
-    Exact for planes at any tilt. A window that straddles a depth edge mixes both sides: use :func:`gated_normals` there.
+    Exact for planes at any tilt. A window that straddles a depth edge mixes both sides.
 
     Parameters
     ----------
@@ -105,34 +108,6 @@ def normals_from_depth(depth: NDArray[np.floating], camera: Camera, radius: int 
     return _facing(_fit(_box(_moments(depth, camera), radius))[0], camera.rays, depth)
 
 
-def gated_normals(
-    depth: NDArray[np.floating], camera: Camera, radius: int = 4, gate: float = 0.05
-) -> Float64:
-    """Fit a plane to each pixel's window, leaving out neighbours across depth edges.
-
-    Parameters
-    ----------
-    depth, camera, radius
-        As for :func:`normals_from_depth`.
-    gate
-        A neighbour j counts where ``|z_j - z_i| <= gate z_i``; 0.05 after GeoNet's common value.
-
-    Returns
-    -------
-    As :func:`normals_from_depth`; costs a pass per pixel of the window.
-    """
-    terms = np.pad(_moments(depth, camera), ((radius, radius), (radius, radius), (0, 0)))
-    z = np.pad(np.asarray(depth, dtype=np.float64), radius, constant_values=np.nan)
-    height, width = camera.shape
-    sums = np.zeros((height, width, 10))
-    for dv in range(2 * radius + 1):
-        for du in range(2 * radius + 1):
-            window = slice(dv, dv + height), slice(du, du + width)
-            near = np.abs(z[window] - depth) <= gate * depth  # NaN compares false
-            sums += np.where(near[..., None], terms[window], 0.0)
-    return _facing(_fit(sums)[0], camera.rays, depth)
-
-
 class PlaneField:
     """Planes through a depth image wherever they are asked for, in windows as large as the surface is flat.
 
@@ -148,12 +123,10 @@ class PlaneField:
     """
 
     def __init__(self, depth: NDArray[np.floating], camera: Camera) -> None:
-        from tofcapture.ops.kernels.planes import table
-
         if depth.shape != camera.shape:
             raise DataError(f"normals: expected depth of shape {camera.shape}, got {depth.shape}")
         self._camera = camera.pinhole("plane field")
-        self._sums = table(depth, camera.rays[0, :, 0].copy(), camera.rays[:, 0, 1].copy())
+        self._sums = _table(depth, camera.rays[0, :, 0].copy(), camera.rays[:, 0, 1].copy())
 
     def at(self, pixels: Float64, radii: Sequence[int] = RADII) -> tuple[Float64, Float64]:
         """Planes at pixel coordinates.
@@ -173,20 +146,52 @@ class PlaneField:
         residual
             (n,) standard deviation of inverse depth about it, 1 / metres; NaN where no window is flat.
         """
-        from tofcapture.ops.kernels.planes import CELL, choose, residuals
-
         pixels = np.ascontiguousarray(pixels, dtype=np.float64)
         cells = np.array([max(1, r // CELL) for r in radii])
         some = pixels[np.isfinite(pixels[:, 0])]
         some = np.ascontiguousarray(some[:: max(1, len(some) // TYPICAL)])
         found = np.empty((len(some), len(radii)))
-        residuals(self._sums, some, cells, _MIN_SPREAD, found)
+        _residuals(self._sums, some, cells, _MIN_SPREAD, found)
         limits = TOLERANCE * np.array([_typical(found[:, k]) for k in range(len(radii))])
         chosen, residual = np.empty((len(pixels), 3)), np.empty(len(pixels))
         eye = self._camera
         rays = (pixels - [eye.cx, eye.cy]) / [eye.fx, eye.fy]
-        choose(self._sums, pixels, cells, limits, _MIN_SPREAD, rays, chosen, residual)
+        _choose(self._sums, pixels, cells, limits, _MIN_SPREAD, rays, chosen, residual)
         return chosen, residual
+
+    def smooth(
+        self, depth: Float64, normals: Float64, pixels: Float64, camera: Camera, T_camera_own: Float64
+    ) -> tuple[Float64, Float64]:
+        """Move what another camera's rays hit onto the planes that fit the surface there, where it is flat but for noise.
+
+        A ray's triangle is as noisy as three points. Where the plane through the window about it is as good as planes here
+        are, and passes the triangle within the points' noise, the ray is intersected with that plane.
+
+        Parameters
+        ----------
+        depth, normals
+            (H, W), (H, W, 3) of the hits, that camera's frame, metres.
+        pixels
+            (H, W, 2) where this field's image has the hits; NaN: none.
+        camera, T_camera_own
+            That camera, and (4, 4) this field's frame to its frame.
+
+        Returns
+        -------
+        Depth, and the normals of the best planes that face the camera, a triangle's own where none does.
+        """
+        planes, residuals = self.at(pixels.reshape(-1, 2))
+        depth, normals = depth.copy(), normals.copy()
+        _onto(
+            planes,
+            residuals,
+            T_camera_own,
+            camera.rays.reshape(-1, 3),
+            WITHIN,
+            depth.reshape(-1),
+            normals.reshape(-1, 3),
+        )
+        return depth, normals
 
 
 def _typical(residuals: Float64) -> float:
@@ -195,19 +200,152 @@ def _typical(residuals: Float64) -> float:
     return float(np.median(fitted)) if len(fitted) else np.nan
 
 
-def grazing(points: Float64, normals: Float64, eyes: Sequence[Float64]) -> Bool:
-    """Say where a surface is seen at more than 75 degrees from its normal.
-
-    Parameters
-    ----------
-    points, normals
-        (..., 3), one frame, metres; NaN gives False.
-    eyes
-        Camera centres (3,) in that frame; one grazing view is enough.
-    """
-    out = np.zeros(points.shape[:-1], dtype=bool)
-    for eye in eyes:
-        rays = points - eye
-        cosine = -np.einsum("...c,...c->...", normals, rays) / np.linalg.norm(rays, axis=-1)
-        out |= cosine < GRAZING_COSINE
+@compiled
+def _table(depth: NDArray[np.floating], x: Float64, y: Float64) -> Float64:
+    """Sum the terms of :func:`_moments` over all cells above and to the left: (rows + 1, columns + 1, 10); NaN counts nothing."""
+    height, width = depth.shape
+    rows, columns = (height + CELL - 1) // CELL, (width + CELL - 1) // CELL
+    out = np.zeros((rows + 1, columns + 1, 10))
+    line = np.empty((columns, 10))
+    for row in range(rows):
+        line[:] = 0
+        for v in range(row * CELL, min(height, (row + 1) * CELL)):
+            for u in range(width):
+                z = depth[v, u]
+                if z > 0:
+                    q, cell = 1 / np.float64(z), line[u // CELL]
+                    cell[0] += 1
+                    cell[1] += x[u]
+                    cell[2] += y[v]
+                    cell[3] += x[u] * x[u]
+                    cell[4] += x[u] * y[v]
+                    cell[5] += y[v] * y[v]
+                    cell[6] += q
+                    cell[7] += x[u] * q
+                    cell[8] += y[v] * q
+                    cell[9] += q * q
+        run = np.zeros(10)
+        for column in range(columns):
+            for k in range(10):
+                run[k] += line[column, k]
+                out[row + 1, column + 1, k] = out[row, column + 1, k] + run[k]
     return out
+
+
+@compiled
+def _fit_sums(sums: Float64, min_spread: float, plane: Float64) -> float:
+    """Fit ``plane . ray = 1 / depth`` to sums (10,); returns the residual of inverse depth, NaN where undetermined."""
+    n = sums[0]
+    if not n > 2.5:
+        return np.nan
+    x, y, q = sums[1] / n, sums[2] / n, sums[6] / n
+    cxx, cxy, cyy = sums[3] / n - x * x, sums[4] / n - x * y, sums[5] / n - y * y
+    cxq, cyq = sums[7] / n - x * q, sums[8] / n - y * q
+    det = cxx * cyy - cxy * cxy
+    if not det > min_spread * (cxx + cyy) ** 2:
+        return np.nan
+    plane[0], plane[1] = (cyy * cxq - cxy * cyq) / det, (cxx * cyq - cxy * cxq) / det
+    plane[2] = q - plane[0] * x - plane[1] * y
+    left = sums[9] / n - q * q - plane[0] * cxq - plane[1] * cyq
+    return np.sqrt(max(left, 0.0) * n / max(n - 3, 1.0))  # type: ignore[no-any-return]
+
+
+@compiled
+def _fit_window(
+    sums: Float64, u: int, v: int, r: int, min_spread: float, window: Float64, plane: Float64
+) -> float:
+    """Fit a plane in the window of radius ``r`` about cell (u, v); as :func:`_fit_sums`, ``window`` (10,) is for its use."""
+    left, right = max(u - r, 0), min(u + r + 1, sums.shape[1] - 1)
+    top, bottom = max(v - r, 0), min(v + r + 1, sums.shape[0] - 1)
+    for k in range(10):
+        window[k] = (sums[bottom, right, k] - sums[top, right, k]) - (
+            sums[bottom, left, k] - sums[top, left, k]
+        )
+    return _fit_sums(window, min_spread, plane)
+
+
+@compiled
+def _residuals(
+    sums: Float64, pixels: Float64, radii: NDArray[np.int64], min_spread: float, out: Float64
+) -> None:
+    """Compute residuals (n, r) of the planes in windows of every radius (in cells) about pixels (n, 2)."""
+    window, plane = np.empty(10), np.empty(3)
+    for i in range(len(pixels)):
+        u, v = int(np.rint(pixels[i, 0])) // CELL, int(np.rint(pixels[i, 1])) // CELL
+        for j in range(len(radii)):
+            out[i, j] = _fit_window(sums, u, v, radii[j], min_spread, window, plane)
+
+
+@compiled
+def _choose(
+    sums: Float64, pixels: Float64, radii: NDArray[np.int64], limits: Float64, min_spread: float, rays: Float64,
+    chosen: Float64, residual: Float64,
+) -> None:  # fmt: skip
+    """Of every pixel's windows take the largest one's plane whose residual is within the limits, else the smallest one's.
+
+    A plane through a bent surface misses its middle by an amount that grows with the square of the window; two windows tell
+    it, and the plane is moved to where it vanishes. ``rays`` (n, 2) are x and y at the pixels. ``residual`` (n,) is that of
+    a plane within the limits, NaN otherwise. Pixels (n, 2) of NaN get NaN.
+    """
+    window, large, small = np.empty(10), np.empty(3), np.empty(3)
+    for i in range(len(pixels)):
+        chosen[i, :], residual[i] = np.nan, np.nan
+        if not np.isfinite(pixels[i, 0]):
+            continue
+        u, v = int(np.rint(pixels[i, 0])) // CELL, int(np.rint(pixels[i, 1])) // CELL
+        for j in range(len(radii) - 1, -1, -1):
+            left = _fit_window(sums, u, v, radii[j], min_spread, window, large)
+            if np.isfinite(left):  # the smallest such window stays where none is flat
+                chosen[i, :] = large
+            if not left <= limits[j]:
+                continue
+            residual[i] = left
+            if j > 0 and np.isfinite(_fit_window(sums, u, v, radii[j - 1], min_spread, window, small)):
+                there = large[0] * rays[i, 0] + large[1] * rays[i, 1] + large[2]
+                inner = small[0] * rays[i, 0] + small[1] * rays[i, 1] + small[2]
+                share = ((2 * radii[j - 1] + 1) / (2 * radii[j] + 1)) ** 2
+                chosen[i, :] *= (inner - share * there) / (1 - share) / there
+            break
+
+
+@compiled
+def _onto(
+    planes: Float64, residuals: Float64, pose: Float64, rays: Float64, within: float, depth: Float64, normals: Float64
+) -> None:  # fmt: skip
+    """Move hits onto the planes that fit their surroundings, in place.
+
+    ``planes`` (n, 3) m with ``m . p = 1`` in the frame that ``pose`` maps to the rays' frame, ``rays`` (n, 3). A plane that
+    faces the eye gives the normal; where its residual is known and the hit lies within so many of it, it gives the depth.
+    """
+    m = np.empty(3)
+    for i in range(len(planes)):
+        for k in range(3):
+            m[k] = pose[k, 0] * planes[i, 0] + pose[k, 1] * planes[i, 1] + pose[k, 2] * planes[i, 2]
+        along = m[0] * rays[i, 0] + m[1] * rays[i, 1] + m[2] * rays[i, 2]
+        if not along > 0:  # NaN compares false
+            continue
+        size = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+        for k in range(3):
+            normals[i, k] = -m[k] / size
+        there = (1 + m[0] * pose[0, 3] + m[1] * pose[1, 3] + m[2] * pose[2, 3]) / along
+        if abs(1 / there - 1 / depth[i]) <= within * residuals[i]:
+            depth[i] = there
+
+
+@compiled
+def grazing(
+    depth: NDArray[np.floating], normals: Float64, rays: Float64, second_eye: Float64, out: Bool
+) -> None:
+    """Mark in ``out`` (H, W) where either eye sees a surface at more than 75 degrees from its normal; NaN is not marked.
+
+    ``depth`` (H, W), ``normals`` (H, W, 3) and ``rays`` (H, W, 3) with z = 1 are in the frame of the first eye, metres.
+    ``second_eye`` (3,) is where the other one stands in it.
+    """
+    for v in range(out.shape[0]):
+        for u in range(out.shape[1]):
+            z, n = depth[v, u], normals[v, u]
+            x, y = rays[v, u, 0] * z, rays[v, u, 1] * z
+            a, b, c = x - second_eye[0], y - second_eye[1], z - second_eye[2]
+            first = -(n[0] * x + n[1] * y + n[2] * z) / np.sqrt(x * x + y * y + z * z)
+            second = -(n[0] * a + n[1] * b + n[2] * c) / np.sqrt(a * a + b * b + c * c)
+            out[v, u] = first < GRAZING_COSINE or second < GRAZING_COSINE

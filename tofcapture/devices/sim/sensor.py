@@ -16,7 +16,7 @@ from tofcapture.devices.sim.light import Light
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
 from tofcapture.ops.phase import Complex128, frequencies, radius_px
-from tofcapture.ops.phase.phasor import solution
+from tofcapture.ops.phase.phasors import solution
 from tofcapture.poses import Float64
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError, image_places
 

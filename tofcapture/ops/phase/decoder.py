@@ -1,38 +1,36 @@
 """Decoding at the speed of the sensor and more: one camera's tables built once, float32, blocks that stay in the cache.
 
-The same mathematics as :func:`tofcapture.ops.phase.decode`, which is its oracle in the tests. Only additions, products,
-quotients and square roots of float32 are used, so that the same frame gives the same bits on every machine.
+The same mathematics as :func:`tofcapture.ops.phase.decode`, which the tests hold it against.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.camera import Camera
 from tofcapture.errors import DataError
-from tofcapture.flags import TofFlag
-from tofcapture.frames import TofInfo
+from tofcapture.frames import TofFlag, TofInfo
 from tofcapture.ops.phase.float32 import Correction, Float32, combine, tap_weights, turns_of
-from tofcapture.ops.phase.flying import flying_pixels
 from tofcapture.ops.phase.noise import TapNoise
-from tofcapture.ops.phase.phasor import ambiguity, frequencies
+from tofcapture.ops.phase.phasors import ambiguity, frequencies
 from tofcapture.ops.phase.unwrapping import whole_ratio
 from tofcapture.rig import RangeError
 
+UNKNOWN_CELSIUS = 45.0
 _BLOCK = 1 << 16  # pixels; temporaries stay in a core's caches, and calls stay long against their overhead
 _AMBIGUOUS = 0.25  # wraps of disagreement between the frequencies
 _UNCERTAIN = 0.020  # m, standard deviation from which a pixel is of low confidence
-UNKNOWN_CELSIUS = 45.0
+_STEEP = float(np.tan(np.radians(80)))
 
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """What the fast decoder yields, each (H, W).
+    """What the decoder yields, each (H, W).
 
     Attributes
     ----------
@@ -41,7 +39,7 @@ class DepthMaps:
     confidence
         float32, amplitude of the high frequency, raw units.
     flags
-        uint8, bits of :class:`tofcapture.flags.TofFlag`; 0 is a good pixel.
+        uint8, bits of :class:`tofcapture.frames.TofFlag`; 0 is a good pixel.
     """
 
     depth: Float32
@@ -67,7 +65,7 @@ class Signals:
 
 
 class Decoder:
-    """Decodes raw frames of one camera.
+    """Decodes raw frames of one camera; its buffers serve one thread.
 
     Parameters
     ----------
@@ -98,39 +96,22 @@ class Decoder:
         self._lean = self._R[1] * hz[1] ** 2 / (hz[0] ** 2 + hz[1] ** 2)
         self._min_power = float(np.square(min_amplitude))
         self._dim = self._R[1] ** 2 / (8 * np.pi**2 * _UNCERTAIN**2)
-        self._geometry()
-        size = min(_BLOCK, info.camera.width * info.camera.height)
+        # z = (D^2 - |s|^2 / 4) / (D L - r . s / 2), r the ray with z = 1, L its length, s the light source.
+        s = np.asarray(info.illuminator, dtype=np.float64)
+        self._length = info.camera.ray_lengths.ravel().astype(np.float32)
+        self._slant = (info.camera.rays @ s / 2).ravel().astype(np.float32)
+        self._quarter, self._nearest = float(s @ s / 4), float(np.sqrt(s @ s) / 2)
+        pixels = info.camera.width * info.camera.height
+        size = min(_BLOCK, pixels)
         # In-phase, quadrature, amplitude and scratch of both frequencies, and the mean tap of the high one.
         self._buffers = np.empty((4, 2, size), np.float32), np.empty(size, np.float32)
-        self._scratch = np.empty((2, info.camera.width * info.camera.height), np.float32)
+        self._scratch = np.empty((2, pixels), np.float32)
         self._indices = np.empty(size, np.int32), np.empty(size, np.int64)
         self._dark = np.array([[c.dark] for c in self._corrections], np.float32)
         self._darkness = np.zeros((2, size if self._dark.any() else 0), np.float32)
 
-    def _geometry(self) -> None:
-        """Tables of ``z = (D^2 - |s|^2 / 4) / (D L - r . s / 2)``, r the ray with z = 1 and L its length."""
-        camera, s = self.info.camera, np.asarray(self.info.illuminator, dtype=np.float64)
-        self._length = camera.ray_lengths.ravel().astype(np.float32)
-        self._slant = (camera.rays @ s / 2).ravel().astype(np.float32)
-        self._quarter, self._nearest = float(s @ s / 4), float(np.sqrt(s @ s) / 2)
-
-    def __call__(
-        self, raw: NDArray[Any], celsius: float = float("nan"), out: DepthMaps | None = None
-    ) -> DepthMaps:
-        """Decode one frame.
-
-        Parameters
-        ----------
-        raw
-            (K, H, W) taps, any real dtype.
-        celsius
-            Sensor temperature; NaN: unknown.
-        out
-            What an earlier call returned, to be overwritten; ``None``: new arrays.
-
-        Returns
-        -------
-        DepthMaps
+    def __call__(self, raw: NDArray[Any], celsius: float = float("nan")) -> DepthMaps:
+        """Decode one frame (K, H, W) of taps, any real dtype; ``celsius`` NaN: unknown.
 
         Raises
         ------
@@ -138,27 +119,19 @@ class Decoder:
             When ``raw`` is of another shape.
         """
         self._expect(raw.shape)
-        return self._decode(raw, celsius, 1, self._saturated(raw.max(axis=0)), out)
+        return self._decode(raw, celsius, 1, raw.max(axis=0))
 
     def signals(self, raw: NDArray[Any], celsius: float = float("nan")) -> tuple[DepthMaps, Signals]:
         """Decode one frame (K, H, W), or the mean of some, and keep the phasors and the gap between the frequencies."""
         self._expect(raw.shape)
         shape = self.info.camera.shape
         kept = Signals(np.empty((2, 2, *shape), np.float32), np.empty(shape, np.float32))
-        maps = self._decode(raw, celsius, 1, self._saturated(raw.max(axis=0)), kept=kept)
-        return maps, kept
+        return self._decode(raw, celsius, 1, raw.max(axis=0), kept), kept
 
     def burst(self, raw: NDArray[Any], celsius: float = float("nan")) -> DepthMaps:
         """Decode a burst (frames, K, H, W), averaged as I and Q; a pixel is saturated when it is in any frame."""
         self._expect(raw.shape[1:])
-        mean = raw.mean(axis=0, dtype=np.float64)
-        return self._decode(mean, celsius, len(raw), self._saturated(raw.max(axis=(0, 1))))
-
-    def _saturated(self, largest: NDArray[Any]) -> NDArray[np.bool_]:
-        # Integers are compared with an integer: not one of them is converted.
-        limit = self.info.saturation if largest.dtype.kind == "f" else math.ceil(self.info.saturation)
-        out: NDArray[np.bool_] = np.asarray(largest >= limit)
-        return out
+        return self._decode(raw.mean(axis=0, dtype=np.float64), celsius, len(raw), raw.max(axis=(0, 1)))
 
     def _expect(self, shape: tuple[int, ...]) -> None:
         expected = (len(self.info.modulation_hz), *self.info.camera.shape)
@@ -170,29 +143,30 @@ class Decoder:
         raw: NDArray[Any],
         celsius: float,
         frames: int,
-        saturated: NDArray[np.bool_],
-        out: DepthMaps | None = None,
+        largest: NDArray[Any],
         kept: Signals | None = None,
     ) -> DepthMaps:
         camera = self.info.camera
         celsius = celsius if np.isfinite(celsius) else UNKNOWN_CELSIUS
         flat = np.ascontiguousarray(raw).reshape(len(raw), -1)
         n = flat.shape[1]
-        out = out or _empty_maps(camera.shape)
-        depth, confidence, flags = out.depth.reshape(-1), out.confidence.reshape(-1), out.flags.reshape(-1)
+        depth, confidence, flags = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.uint8)
         bad = np.empty(n, bool)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            for at in _blocks(n):
+            for at in (slice(i, min(i + _BLOCK, n)) for i in range(0, n, _BLOCK)):
                 iq = None if kept is None else kept.phasor.reshape(2, 2, -1)[..., at]
                 phases = self._phases(flat[:, at], frames, confidence[at], flags[at], bad[at], iq)
                 gap = None if kept is None else kept.gap.reshape(-1)[at]
                 self._ranges(phases, at, celsius, flags[at], gap)
                 self._depth(phases, at, depth[at], bad[at])
-        image, bits = out.depth, out.flags
+        # Integers are compared with an integer: not one of them is converted.
+        limit = self.info.saturation if largest.dtype.kind == "f" else math.ceil(self.info.saturation)
+        saturated = largest >= limit
+        image, bits = depth.reshape(camera.shape), flags.reshape(camera.shape)
         bits |= saturated
         np.copyto(image, np.nan, where=bad.reshape(camera.shape) | saturated)
         bits |= flying_pixels(image, camera, self._scratch).view(np.uint8) * np.uint8(TofFlag.FLYING)
-        return out
+        return DepthMaps(image, confidence.reshape(camera.shape), bits)
 
     def _phases(
         self,
@@ -203,7 +177,7 @@ class Decoder:
         bad: NDArray[np.bool_],
         iq: Float32 | None,
     ) -> tuple[Float32, Float32]:
-        """Phases of both frequencies in turns, [0, 1), and scratch; amplitude and what it decides on the way."""
+        """Compute phases of both frequencies in turns, [0, 1), and scratch; amplitude and what it decides on the way."""
         n = raw.shape[1]
         real, imag, size, work = self._buffers[0][..., :n]
         limit = self._buffers[1][:n]
@@ -234,7 +208,7 @@ class Decoder:
         flags: NDArray[np.uint8],
         kept: Float32 | None,
     ) -> None:
-        """Ranges without their systematic errors, the high one unwrapped, both fused; the result lies in the low one."""
+        """Free ranges of their systematic errors, unwrap the high one, fuse both; the result lies in the low one."""
         (low, high), (gap, work) = phases
         indices = [index[: low.size] for index in self._indices]
         for correct, range_, dark in zip(self._corrections, (low, high), self._darkness, strict=True):
@@ -265,9 +239,34 @@ class Decoder:
         np.divide(work, range_, out=depth)
 
 
-def _empty_maps(shape: tuple[int, int]) -> DepthMaps:
-    return DepthMaps(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
+def flying_pixels(
+    depth: NDArray[np.floating[Any]], camera: Camera, scratch: NDArray[np.floating[Any]] | None = None
+) -> NDArray[np.bool_]:
+    """Find pixels that neither neighbour of a row, or neither of a column, supports.
 
+    A mixed pixel hangs between two surfaces (method.md 4.4): depth jumps on both of its sides by more than a surface at 80
+    degrees makes from one pixel to the next. Pixels beside holes are not flagged for them.
 
-def _blocks(n: int) -> Iterator[slice]:
-    return (slice(i, min(i + _BLOCK, n)) for i in range(0, n, _BLOCK))
+    Parameters
+    ----------
+    depth
+        (H, W), metres; NaN: none.
+    camera
+        Gives the distance between neighbouring rays.
+    scratch
+        (2, H W) of depth's dtype, overwritten; ``None``: made here.
+    """
+    step_of, steep_of = np.empty((2, depth.size), depth.dtype) if scratch is None else scratch
+    out = np.zeros(depth.shape, dtype=bool)
+    flat, jump = np.ascontiguousarray(depth).ravel(), np.zeros(depth.shape, dtype=bool)
+    with np.errstate(invalid="ignore"):
+        # Row after row as one: a step across a seam is taken for column 0, which has no left neighbour and is not asked.
+        for stride, focal in ((1, camera.fx), (depth.shape[1], camera.fy)):
+            step = np.subtract(flat[stride:], flat[:-stride], out=step_of[stride:])
+            steep = np.multiply(flat[stride:], _STEEP / focal, out=steep_of[stride:])
+            np.greater(np.abs(step, out=step), steep, out=jump.ravel()[stride:])
+            if stride == 1:
+                np.logical_and(jump[:, 1:-1], jump[:, 2:], out=out[:, 1:-1])
+            else:
+                out[1:-1] |= jump[1:-1] & jump[2:]
+    return out

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.frames import TofInfo
-from tofcapture.ops.phase.phasor import ambiguity, frequencies, solution
+from tofcapture.ops.phase.phasors import ambiguity, frequencies, solution
 from tofcapture.rig import RangeError
 
 Float32 = NDArray[np.float32]
@@ -36,11 +36,11 @@ _SIGN = np.uint32(0x80000000)
 
 
 def tap_weights(info: TofInfo) -> NDArray[np.float64]:
-    """(5, K) that turn taps into I of both frequencies, Q of both, and the mean tap of the high one."""
+    """Compute the rows (5, K) that turn taps into I of both frequencies, Q of both, and the mean tap of the high one."""
     hz = frequencies(info.modulation_hz)
-    solved = [solution(info.modulation_hz, info.phase_rad, f) for f in hz]
     rows = np.zeros((5, len(info.modulation_hz)))
-    for i, (channels, (mean, cosine, sine)) in enumerate(solved):
+    for i, f in enumerate(hz):
+        channels, (mean, cosine, sine) = solution(info.modulation_hz, info.phase_rad, f)
         rows[i, channels], rows[2 + i, channels] = cosine, -sine
         if i:
             rows[4, channels] = mean
@@ -52,7 +52,7 @@ def tap_weights(info: TofInfo) -> NDArray[np.float64]:
 
 
 def combine(raw: NDArray[Any], row: NDArray[np.float64], out: Float32, work: Float32) -> None:
-    """Weighted sum of channels; sums and differences of two, the usual case, are taken in one pass."""
+    """Add weighted channels (K, n) up; sums and differences of two, the usual case, are taken in one pass."""
     first, *others = np.flatnonzero(row)
     if len(others) == 1 and abs(abs(row[first]) - abs(row[others[0]])) < 1e-12:
         pair = np.add if row[first] * row[others[0]] > 0 else np.subtract
@@ -66,7 +66,7 @@ def combine(raw: NDArray[Any], row: NDArray[np.float64], out: Float32, work: Flo
 
 
 def turns_of(real: Float32, imag: Float32, size: Float32, work: Float32) -> None:
-    """Phase in turns, [0, 1), of a phasor; the result replaces its size, all else is used up.
+    """Compute the phase of a phasor in turns, [0, 1); the result replaces its size, all else is used up.
 
     ``phi = 2 atan(imag / (size + |real|))`` on the right half plane; on the left one it is half a turn minus that.
     """
@@ -90,30 +90,25 @@ def turns_of(real: Float32, imag: Float32, size: Float32, work: Float32) -> None
     turns -= np.floor(turns, out=work)
 
 
-def _undo(error: RangeError, R: float, constant: NDArray[np.floating[Any]]) -> tuple[Float32, float, float]:
-    """Table of ``t`` with ``t + h(t) = y``, h what of the error depends on the range; its first y and its step, metres.
-
-    The table holds ``t - (y - start)``, which is small: float32 keeps it to nanometres.
-    """
-    start = -float(constant.max()) - _MARGIN * R
-    step = R / _TABLE
-    count = int(((1 + 2 * _MARGIN) * R + float(np.ptp(constant))) / step) + 2
-    # An entry stands for the interval in whose middle it is computed.
-    y = start + step * (np.arange(count) + 0.5)
-    varying = RangeError(error.modulation_hz, scale=error.scale, harmonics=error.harmonics)
-    t = y.copy()
-    for _ in range(40):
-        t = y - varying.at(t * 2 * np.pi / R, 0.0, 0.0)
-    return (t - y + start).astype(np.float32), start, step
-
-
 class Correction:
-    """Range error of one frequency as a table over its measured range, for one camera."""
+    """Range error of one frequency as a table over its measured range, for one camera.
+
+    The table holds ``t - (y - start)`` with ``t + h(t) = y``, h what of the error depends on the range: small numbers,
+    which float32 keeps to nanometres. ``start`` is its first y, ``step`` its step, metres.
+    """
 
     def __init__(self, error: RangeError, camera: Camera) -> None:
         self.R = ambiguity(error.modulation_hz)
         fixed = error.pixels(camera).ravel()
-        self.table, self.start, self.step = _undo(error, self.R, fixed)
+        self.start, self.step = -float(fixed.max()) - _MARGIN * self.R, self.R / _TABLE
+        count = int(((1 + 2 * _MARGIN) * self.R + float(np.ptp(fixed))) / self.step) + 2
+        # An entry stands for the interval in whose middle it is computed.
+        y = self.start + self.step * (np.arange(count) + 0.5)
+        varying = RangeError(error.modulation_hz, scale=error.scale, harmonics=error.harmonics)
+        t = y.copy()
+        for _ in range(40):
+            t = y - varying.at(t * 2 * np.pi / self.R, 0.0, 0.0)
+        self.table = (t - y + self.start).astype(np.float32)
         self.fixed = ((fixed + self.start) / self.step).astype(np.float32)
         self.per_kelvin, self.reference = error.per_kelvin / self.step, error.reference_celsius
         self.plain = not (error.harmonics or error.scale)

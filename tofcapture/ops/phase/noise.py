@@ -35,9 +35,9 @@ class TapNoise:
 def photon_transfer(bursts: Iterable[NDArray[np.generic]], saturation: float) -> TapNoise:
     """Measure the noise of a sensor from bursts of still scenes: the line of variance over mean.
 
-    The shot noise of ``n`` electrons has the variance ``n``, so the slope is the raw units that an electron makes, and what is left in the dark
-    is the electronics' (and less the rounding to whole units, which is not theirs). Taps are sorted into bins of equal number by their mean;
-    the line is weighted by what each bin's variance is worth. Pixels that are noisier than all others of their brightness are left out.
+    The shot noise of ``n`` electrons has the variance ``n``, so the slope is the raw units that an electron makes. What is
+    left in the dark is the electronics', less the rounding to whole units. Taps are sorted by their mean into bins of equal
+    number, which are weighted by what their variance is worth. Pixels noisier than all others of their brightness are left out.
 
     Parameters
     ----------
@@ -48,7 +48,8 @@ def photon_transfer(bursts: Iterable[NDArray[np.generic]], saturation: float) ->
 
     Returns
     -------
-    Infinite electrons per unit where brighter taps are not noisier.
+    TapNoise
+        With infinite electrons per unit where brighter taps are not noisier.
 
     Raises
     ------
@@ -79,6 +80,6 @@ def photon_transfer(bursts: Iterable[NDArray[np.generic]], saturation: float) ->
 
 
 def _point(mean: NDArray[np.float64], variance: NDArray[np.float64]) -> tuple[float, float]:
-    """Mean tap and mean variance of a bin, without its outliers."""
+    """Average tap and variance of a bin without its outliers."""
     usual = variance <= _OUTLIER * max(float(np.median(variance)), _ROUNDING)
     return float(mean[usual].mean()), float(variance[usual].mean())

@@ -1,22 +1,19 @@
-"""Which wrap of the high frequency: by the low one, by the likelihood of both phasors, or with the neighbours' support.
+"""Which wrap of the high frequency: by the low one alone, or with the neighbours' support.
 
-With two frequencies and no further knowledge the likelihood chooses the very wrap that rounding chooses: whatever the two
-amplitudes, its best value within a wrap falls with the gap that this wrap leaves between the frequencies. What it adds is a
-fusion weighted by the amplitudes found, and a limit of range. Fewer wrong wraps come from neighbours only.
+With two frequencies the likelihood of both phasors chooses the very wrap that rounding chooses, whatever the amplitudes:
+its best value within a wrap falls with the gap that this wrap leaves. Fewer wrong wraps come from neighbours only.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.errors import DataError
-from tofcapture.ops.phase.phasor import Float64
+from tofcapture.ops.phase.phasors import Float64
 
-Unwrapping = Literal["hierarchical", "likelihood", "spatial"]
-_NEWTON_STEPS = 4
 _CERTAIN = 0.1  # wraps; at five standard deviations of the gap to half a wrap, rounding is right
 _UNBELIEVABLE = 4.0  # standard deviations of a pixel's own gap that no neighbours make likely
 
@@ -43,72 +40,6 @@ def unwrap(range_low: Float64, range_high: Float64, ambiguity_high: float, ambig
     return range_high + k * ambiguity_high
 
 
-def centred(difference: NDArray[np.floating[Any]], period: float) -> Float64:
-    """Difference of two ranges that wrap at ``period``, in [-period/2, period/2)."""
-    out: Float64 = np.mod(difference + period / 2, period) - period / 2
-    return out
-
-
-def _peak(gap: Float64, weight: Float64, R_low: float, R_high: float) -> tuple[Float64, Float64]:
-    """Offset x from the high frequency's range with the largest ``a cos(w_l (gap - x)) + b cos(w_h x)``, and that value."""
-    low, high = 2 * np.pi / R_low, 2 * np.pi / R_high
-    a, b = weight
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x = gap * a * low**2 / (a * low**2 + b * high**2)
-        for _ in range(_NEWTON_STEPS):
-            slope = a * low * np.sin(low * (gap - x)) - b * high * np.sin(high * x)
-            bend = a * low**2 * np.cos(low * (gap - x)) + b * high**2 * np.cos(high * x)
-            step = np.where(bend > 0, slope / bend, 0.0)
-            x = np.clip(x + step, -R_high / 2, R_high / 2)
-    return x, a * np.cos(low * (gap - x)) + b * np.cos(high * x)
-
-
-def fuse_likelihood(
-    range_low: Float64,
-    range_high: Float64,
-    amplitude: Float64,
-    ambiguity_high: float,
-    ambiguity_low: float,
-    max_range: float = np.inf,
-) -> tuple[Float64, Float64]:
-    """Unwrap and fuse by the likelihood of both phasors.
-
-    The range d that maximises ``sum_i A_i^2 cos(4 pi f_i d / c - phi_i)``: the log-likelihood of two phasors with equal noise
-    and known amplitudes (method.md 4.3), searched wrap by wrap.
-
-    Parameters
-    ----------
-    range_low, range_high
-        Wrapped ranges, metres, same shape.
-    amplitude
-        (2, ...) of the low and the high frequency.
-    ambiguity_high, ambiguity_low
-        Unambiguous ranges; the low one must be a whole multiple of the high one.
-    max_range
-        Nothing lies farther, metres; wraps beyond it are not considered.
-
-    Returns
-    -------
-    unwrapped
-        Range of the high frequency, unwrapped, metres.
-    fused
-        Most likely range in [0, R_low), metres; NaN where both amplitudes are zero.
-    """
-    ratio = whole_ratio(ambiguity_low, ambiguity_high)
-    weight = np.asarray(amplitude, dtype=np.float64) ** 2
-    best = np.full(range_high.shape, -np.inf)
-    unwrapped, fused = range_high.copy(), np.full(range_high.shape, np.nan)
-    for k in range(ratio):
-        candidate = range_high + k * ambiguity_high
-        gap = centred(range_low - candidate, ambiguity_low)
-        x, value = _peak(gap, weight, ambiguity_low, ambiguity_high)
-        better = (value > best) & ((candidate <= max_range) | (k == 0))
-        best = np.where(better, value, best)
-        unwrapped = np.where(better, candidate, unwrapped)
-        fused = np.where(better, np.mod(candidate + x, ambiguity_low), fused)
-    return unwrapped, fused
-
-
 def unwrap_spatial(
     range_low: Float64,
     range_high: Float64,
@@ -121,18 +52,16 @@ def unwrap_spatial(
     """Unwrap with the neighbours' support where a pixel alone cannot be sure.
 
     A pixel whose gap between the frequencies has a predicted standard deviation above a tenth of a wrap takes the low
-    frequency's phasor from its window instead: the sum of the neighbours' phasors, each weighted by
-    ``cos^4((phi_p - phi_q) / 2)`` of the high frequency's phases, so that surfaces at another range have no say. A wrap that the
-    pixel itself all but rules out, at four standard deviations of its own gap, is not taken.
+    frequency's phasor from its window: the sum of the neighbours' phasors, each weighted by ``cos^4((phi_p - phi_q) / 2)``
+    of the high frequency's phases, so that surfaces at another range have no say. A wrap that the pixel itself all but
+    rules out, at four standard deviations of its own gap, is not taken.
 
     Parameters
     ----------
-    range_low, range_high
-        (H, W) wrapped ranges, metres.
+    range_low, range_high, ambiguity_high, ambiguity_low
+        As for :func:`unwrap`, of shape (H, W).
     amplitude
         (2, H, W) of the low and the high frequency, raw units.
-    ambiguity_high, ambiguity_low
-        Unambiguous ranges; the low one must be a whole multiple of the high one.
     tap_sigma
         Standard deviation of a tap's noise, raw units, scalar or (H, W).
     radius
@@ -164,8 +93,14 @@ def unwrap_spatial(
     return np.where(asked, together, alone)
 
 
+def centred(difference: NDArray[np.floating[Any]], period: float) -> Float64:
+    """Wrap a difference of two ranges into [-period/2, period/2)."""
+    out: Float64 = np.mod(difference + period / 2, period) - period / 2
+    return out
+
+
 def whole_ratio(ambiguity_low: float, ambiguity_high: float) -> int:
-    """How many wraps of the high frequency fit into one of the low; :class:`DataError` when that is no whole number."""
+    """Count the wraps of the high frequency in one of the low; :class:`DataError` when that is no whole number."""
     ratio = round(ambiguity_low / ambiguity_high)
     if abs(ambiguity_low / ambiguity_high - ratio) > 1e-9:
         raise DataError(f"unwrap: expected a whole frequency ratio, got {ambiguity_low / ambiguity_high:.6f}")

@@ -98,7 +98,7 @@ def pictures(view: View) -> dict[str, bytes]:
         min_amplitude=5.0,
     )
     return {
-        "amplitude": png(grey(decoded.confidence)),
+        "amplitude": png(grey(decoded.amplitude[-1])),
         "depth": png(colour(decoded.radial)),
         "stereo": png(colour(view.stereo.points[..., 2].astype(np.float64))),
     }

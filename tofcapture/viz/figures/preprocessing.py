@@ -15,8 +15,7 @@ from tofcapture.frames import View
 from tofcapture.ops.crop import crop_depth, find_crop
 from tofcapture.ops.denoise import denoise
 from tofcapture.ops.phase import Decoder
-from tofcapture.ops.register import register
-from tofcapture.poses import Float64
+from tofcapture.poses import Float64, transform_points
 from tofcapture.rig import Rig, load_rig
 from tofcapture.viz.colours import GROUND_TRUTH, SENSOR
 from tofcapture.viz.figures.clouds import splat, stage_for
@@ -131,7 +130,7 @@ def preprocess(view: View, rig: Rig) -> Steps:
     sparse = clean[::_SPARSE, ::_SPARSE, None] * rig.stereo.rays[::_SPARSE, ::_SPARSE]
     up = (view.arm_before.T_base_flange @ rig.T_flange_tof)[2, :3]
     crop = find_crop(
-        register(sparse, rig.T_tof_stereo, FAR), up, np.random.default_rng(view.index), RADIUS, FAR
+        transform_points(rig.T_tof_stereo, sparse), up, np.random.default_rng(view.index), RADIUS, FAR
     )
     cropped = crop_depth(crop, np.asarray(depth), rig.stereo, rig.T_tof_stereo)
     there = np.isfinite(cropped)
@@ -163,8 +162,8 @@ def _decoded(view: View, rig: Rig) -> Float64:
 
 
 def _placed(points: NDArray[Any], T_tof_stereo: Float64) -> Float64:
-    found = register(points, T_tof_stereo, FAR).reshape(-1, 3)
-    return found[np.isfinite(found).all(axis=1)]
+    found = transform_points(T_tof_stereo, points).reshape(-1, 3)
+    return found[(found[:, 2] > 0) & (found[:, 2] < FAR)]
 
 
 def gap(stereo: Float64, depth: NDArray[np.floating], rig: Rig) -> float:

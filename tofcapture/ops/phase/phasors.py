@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.camera import Camera
 from tofcapture.errors import DataError
 from tofcapture.rig import SPEED_OF_LIGHT
 
@@ -16,26 +17,26 @@ Complex128 = NDArray[np.complex128]
 
 
 def frequencies(modulation_hz: Sequence[float]) -> tuple[float, ...]:
-    """Distinct modulation frequencies, ascending."""
+    """Sort the distinct modulation frequencies, ascending."""
     return tuple(sorted({float(f) for f in modulation_hz}))
 
 
 def ambiguity(modulation_hz: float) -> float:
-    """Unambiguous range ``c / 2f`` in metres: 7.49481145 at 20 MHz, 1.49896229 at 100 MHz."""
+    """Compute the unambiguous range ``c / 2f``, metres: 7.49481145 at 20 MHz, 1.49896229 at 100 MHz."""
     return SPEED_OF_LIGHT / (2 * modulation_hz)
 
 
 def solution(
     modulation_hz: Sequence[float], phase_rad: Sequence[float], hz: float
 ) -> tuple[NDArray[np.int64], Float64]:
-    """Least-squares weights of one frequency.
+    """Solve for the least-squares weights of one frequency.
 
     Returns
     -------
     channels
         (n,) that belong to the frequency.
     weights
-        (3, n): times those taps they give ``B``, ``A cos phi`` and ``-A sin phi``; exact for any >= 3 distinct phases.
+        (3, n): times those taps they give ``B``, ``A cos phi`` and ``-A sin phi``.
 
     Raises
     ------
@@ -55,14 +56,14 @@ def solution(
 
 
 def phasors(raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequence[float]) -> Complex128:
-    """Least-squares phasor of each frequency.
+    """Fit the phasor of each frequency by least squares.
 
     Parameters
     ----------
     raw
         (..., K, H, W) taps, any real dtype, in any order of channels.
     modulation_hz, phase_rad
-        (K,) frequency and demodulation phase of each channel; per frequency the phases must be spread evenly.
+        (K,) frequency and demodulation phase of each channel.
 
     Returns
     -------
@@ -86,28 +87,14 @@ def phasors(raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequen
 
 
 def mean_phasors(raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequence[float]) -> Complex128:
-    """Phasors (F, H, W) of a burst (frames, K, H, W), averaged over the frames as I and Q."""
+    """Average a burst (frames, K, H, W) over its frames as I and Q: phasors (F, H, W)."""
     return phasors(raw.mean(axis=0, dtype=np.float64), modulation_hz, phase_rad)
 
 
 def taps(
     phasor: Complex128, offset: Float64, modulation_hz: Sequence[float], phase_rad: Sequence[float]
 ) -> Float64:
-    """Noise-free taps of phasors; the inverse of :func:`phasors`.
-
-    Parameters
-    ----------
-    phasor
-        (F, H, W), frequencies ascending.
-    offset
-        (F, H, W), the tap's mean B.
-    modulation_hz, phase_rad
-        (K,).
-
-    Returns
-    -------
-    (K, H, W) float64
-    """
+    """Compute noise-free taps (K, H, W) of phasors (F, H, W) and mean taps ``offset`` (F, H, W): inverse of :func:`phasors`."""
     index = {hz: i for i, hz in enumerate(frequencies(modulation_hz))}
     out = [
         offset[index[float(hz)]] + (phasor[index[float(hz)]] * np.exp(1j * theta)).real
@@ -117,6 +104,16 @@ def taps(
 
 
 def wrapped_range(phasor: Complex128, modulation_hz: float) -> Float64:
-    """Range in [0, c / 2f) of a phasor, metres."""
+    """Turn a phasor into its range in [0, c / 2f), metres."""
     out: Float64 = np.mod(np.angle(phasor), 2 * np.pi) * SPEED_OF_LIGHT / (4 * np.pi * modulation_hz)
+    return out
+
+
+def radial_to_range(
+    radial: NDArray[np.floating], camera: Camera, illuminator: NDArray[np.floating]
+) -> Float64:
+    """Compute half the path illuminator - surface - camera of distances along the rays (..., H, W), metres."""
+    radial = np.asarray(radial, dtype=np.float64)
+    points = radial[..., None] * (camera.rays / camera.ray_lengths[..., None])
+    out: Float64 = (radial + np.linalg.norm(points - np.asarray(illuminator), axis=-1)) / 2
     return out
