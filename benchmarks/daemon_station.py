@@ -2,9 +2,10 @@
 
     python benchmarks/daemon_station.py daemon ROOT STATE [--http 127.0.0.1:0] [--station arrays | FILE.toml]
 
-The worker's environment: ``BENCH_DELAY`` seconds per device step, ``BENCH_LOG`` a file that gets a line per stop of the arm,
+The worker's environment: ``BENCH_DELAY`` seconds per device step, ``BENCH_LOG`` a file that gets a line per move and stop of the arm,
 ``BENCH_FULL`` a file: while it exists, the disk is full from the write on whose number stands in it;
-``BENCH_ASKS`` set: a person must confirm the scene; ``BENCH_HOST`` set: the arm has a driver host; ``BENCH_LARGE`` set: images of full size.
+``BENCH_ASKS`` set: a person must confirm the scene; ``BENCH_HOST`` set: the arm has a driver host; ``BENCH_LARGE`` set: images of full size;
+``BENCH_REAL`` set: the arm is a real one. The daemon's: ``BENCH_LOST`` seconds of silence after which a recorder is killed.
 """
 
 from __future__ import annotations
@@ -104,14 +105,18 @@ class _Role:
         return ArmState(self.bench.joints.copy(), forward(MODELS["ur10e"], self.bench.joints), 1)
 
     def move_to(self, joints: Any) -> Any:
+        self._note("move")
         self.bench.step()
         self.bench.joints = self.bench.np.array(joints)
         return self.state()
 
     def stop(self) -> None:
+        self._note("stop")
+
+    def _note(self, word: str) -> None:
         if log := os.environ.get("BENCH_LOG"):
             with Path(log).open("a", encoding="ascii") as file:
-                file.write("stop\n")
+                file.write(f"{word}\n")
 
     def capture(self, frames: int | None = None) -> Any:
         from tofcapture.frames import StereoFrame, TofBurst
@@ -141,6 +146,7 @@ def _open_arrays(path: Path | None = None, seed: int | None = None, allow_motion
 
     del path, allow_motion
     config, bench = read_station(None, seed), _Arrays()
+    _Role.simulated = "BENCH_REAL" not in os.environ
     if "BENCH_ASKS" in os.environ:
         config["operator"] = {"driver": "console"}
     places = transform(np.eye(3), [-0.05, 0.08, 0.0]), transform(np.eye(3), [0.0, -0.035, 0.08])
@@ -286,10 +292,13 @@ def worker(station: str) -> None:
 
 def daemon(args: argparse.Namespace) -> None:
     """Run a daemon whose recorder is :func:`worker`."""
+    from tofcapture.record.daemon import supervisor
     from tofcapture.record.daemon.server import serve, tcp_address
     from tofcapture.record.daemon.settings import Settings
     from tofcapture.record.daemon.state import open_folder
 
+    if lost := os.environ.get("BENCH_LOST"):
+        supervisor._LOST = float(lost)  # noqa: SLF001
     args.root.mkdir(parents=True, exist_ok=True)
     toml = None if args.station == "arrays" else Path(args.station)
     command = (sys.executable, __file__, "worker", "--station", args.station)

@@ -121,8 +121,9 @@ def test_records_a_scene_with_pause_and_previews(tmp_path):
             status, picture, _ = daemon.tcp("GET", f"/v1/preview/{name}", {})
             assert (status, picture[:4]) == (200, b"\x89PNG")
         assert daemon.ask("GET", f"/v1/jobs/{job['id']}")["state"] == "done"
-        kinds = _events(daemon, after=0, wanted=30)
-        assert {"queued", "state", "planned", "step", "sealed", "paused", "resumed"} <= set(kinds)
+        with _stream(daemon, "?after=0") as link:
+            told = _events(link, lambda kind, data: kind == "sealed" and data["progress"]["sealed"] == 6)
+        assert {"paused", "resumed"} <= {kind for _, kind, _ in told}
         assert b"tofcapture_views_sealed_total 6" in daemon.tcp("GET", "/metrics", {})[1]
     for view in views:
         assert (
@@ -131,18 +132,110 @@ def test_records_a_scene_with_pause_and_previews(tmp_path):
         )
 
 
-def _events(daemon, after, wanted):
-    """Kinds of the first events of a stream."""
-    with socket.create_connection(("127.0.0.1", daemon.port), timeout=10) as link:
-        head = f"GET /v1/events?after={after} HTTP/1.1\r\nHost: 127.0.0.1:{daemon.port}\r\n"
-        link.sendall(f"{head}Authorization: Bearer {daemon.token}\r\n\r\n".encode())
-        text = ""
-        while text.count("event: ") < wanted:
-            text += link.recv(65536).decode()
-    numbers = [int(line[4:]) for line in text.splitlines() if line.startswith("id: ")]
-    assert numbers == sorted(set(numbers))
-    assert min(numbers) > after
-    return [line[7:] for line in text.splitlines() if line.startswith("event: ")]
+def _stream(daemon, query="", head=""):
+    """Open a stream of events; the socket, its headers read."""
+    link = socket.create_connection(("127.0.0.1", daemon.port), timeout=20)
+    host = f"Host: 127.0.0.1:{daemon.port}\r\nAuthorization: Bearer {daemon.token}\r\n"
+    link.sendall(f"GET /v1/events{query} HTTP/1.1\r\n{host}{head}\r\n".encode())
+    return link
+
+
+def _events(link, last):
+    """Events of a stream up to the first for which ``last(kind, data)`` holds: (number or ``None``, kind, data)."""
+    field, found, end = {}, [], time.monotonic() + 60
+    with link.makefile("r", encoding="utf-8") as lines:
+        while not (found and last(*found[-1][1:])):
+            assert time.monotonic() < end, found
+            name, _, value = lines.readline().strip().partition(": ")
+            if name:
+                field[name] = value
+            elif "event" in field:
+                number = int(field["id"]) if "id" in field else None
+                found.append((number, field["event"], json.loads(field["data"])))
+                field = {}
+    return found
+
+
+def _idle_again(kind, data):
+    return kind == "state" and data["state"]["phase"] == "idle" and bool(data["state"]["queue"].get("done"))
+
+
+def test_events_come_live_and_again(tmp_path):
+    """A stream tells what happens as it happens, numbered; a client that comes back is told what it missed, once."""
+    with running(tmp_path) as daemon:
+        daemon.ask("POST", "/v1/pause")
+        with _stream(daemon) as link:
+            assert link.recv(4096).startswith(b"HTTP/1.1 200")
+            daemon.ask("POST", "/v1/jobs", {"scene": "mug", "recording": "r", "views": 3, "frames": 2})
+            daemon.ask("POST", "/v1/resume")
+            live = _events(link, _idle_again)
+        kinds = [kind for _, kind, _ in live if kind != "health"]
+        assert kinds[0] == "queued"
+        assert [k for k in kinds if k in {"planned", "step", "sealed"}] == [
+            "planned",
+            *(["step"] * 4 + ["sealed"]) * 3,
+        ]
+        sealed = [data for _, kind, data in live if kind == "sealed"]
+        assert [d["progress"]["sealed"] for d in sealed] == [1, 2, 3]
+        assert all(d["utc"] and d["sha256"] and d["quality"]["frames"] == 2 for d in sealed)
+        numbers = [number for number, kind, _ in live if kind != "health"]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        for query, head in ((f"?after={numbers[2]}", ""), ("", f"Last-Event-ID: {numbers[2]}\r\n")):
+            with _stream(daemon, query, head) as link:
+                again = _events(link, _idle_again)
+            assert [event for event in again if event[1] != "health"] == [
+                event for event in live if event[1] != "health"
+            ][3:]
+
+
+def test_the_time_left_follows_the_pace(tmp_path):
+    """No time is named before a view is there, at rest, and at the end; between, it is that of the views that are left."""
+    delay = 0.1
+    with running(tmp_path, BENCH_DELAY=delay) as daemon:
+        assert daemon.ask("GET", "/v1/state")["progress"]["eta_s"] is None
+        begun = time.monotonic()
+        daemon.ask("POST", "/v1/jobs", {"scene": "mug", "recording": "r", "views": 6, "frames": 2})
+        progress = daemon.wait(lambda s: s["progress"]["sealed"] >= 2)["progress"]
+        left = progress["total"] - progress["sealed"]
+        # Three devices take their time for each view; all views so far took no longer than the test did.
+        slowest = (time.monotonic() - begun) / progress["sealed"]
+        assert 3 * delay * left <= progress["eta_s"] <= slowest * left + 0.1
+        daemon.ask("POST", "/v1/pause")
+        assert daemon.wait(lambda s: s["phase"] == "paused")["progress"]["eta_s"] is None
+        daemon.ask("POST", "/v1/resume")
+        assert daemon.wait(_over)["progress"]["eta_s"] == 0
+
+
+def _recorder(daemon):
+    """The recorder's process id."""
+    pid = daemon.process.pid
+    return int(Path(f"/proc/{pid}/task/{pid}/children").read_text().split()[0])
+
+
+def test_a_recorder_that_hangs_is_found_and_replaced(tmp_path):
+    """A recorder that says nothing is called silent, killed when its time is over, and another one does its work."""
+    with running(tmp_path, BENCH_DELAY=0.05, BENCH_LOST=5) as daemon:
+        daemon.ask("POST", "/v1/jobs", {"scene": "mug", "recording": "r", "views": 8, "frames": 2})
+        assert daemon.wait(lambda s: s["progress"]["sealed"] >= 1)["health"]["recorder"] == "alive"
+        os.kill(_recorder(daemon), signal.SIGSTOP)
+        silent = daemon.wait(lambda s: s["health"]["recorder"] == "silent")["health"]
+        assert silent["silence_s"] >= 3
+        assert silent["restarts"] == 0
+        state = daemon.wait(_over, 60)
+        assert (state["job"]["state"], state["health"]["restarts"]) == ("done", 1)
+        assert state["progress"]["sealed"] == 8
+
+
+def test_a_real_arm_does_not_move_unasked(tmp_path):
+    """A daemon that nobody allowed to move the arm moves no real one: the job waits, and the daemon says for what."""
+    log = tmp_path / "log"
+    with running(tmp_path, BENCH_REAL=1, BENCH_LOG=log) as daemon:
+        assert daemon.ask("GET", "/v1/state")["allow_motion"] is False
+        daemon.ask("POST", "/v1/jobs", {"scene": "mug", "recording": "r", "views": 2, "frames": 2})
+        state = daemon.wait(lambda s: s["phase"] == "paused")
+        assert "--allow-motion" in state["reason"]
+        assert state["queue"] == {"queued": 1}
+    assert "move" not in (log.read_text() if log.exists() else "")
 
 
 def test_stop_keeps_what_is_sealed(tmp_path):
@@ -180,11 +273,8 @@ def test_sigterm_with_open_streams(tmp_path):
     with running(tmp_path, BENCH_DELAY=0.2, BENCH_LOG=log) as daemon:
         daemon.ask("POST", "/v1/jobs", {"scene": "mug", "recording": "r", "views": 4, "frames": 2})
         daemon.wait(lambda s: s["doing"])
-        links = [socket.create_connection(("127.0.0.1", daemon.port), timeout=10) for _ in range(20)]
-        for link in links:
-            head = f"GET /v1/events HTTP/1.1\r\nHost: 127.0.0.1:{daemon.port}\r\nAuthorization: Bearer {daemon.token}\r\n\r\n"
-            link.sendall(head.encode())
-            assert link.recv(20)
+        links = [_stream(daemon) for _ in range(20)]
+        assert all(link.recv(20) for link in links)
         begin = time.monotonic()
         daemon.process.send_signal(signal.SIGTERM)
         assert daemon.process.wait(10) == 0
@@ -205,12 +295,12 @@ def test_the_daemon_dies_and_the_arm_stops(tmp_path):
     log = tmp_path / "log"
     with running(tmp_path, BENCH_DELAY=0.3, BENCH_LOG=log) as daemon:
         daemon.ask("POST", "/v1/jobs", {"scene": "mug", "recording": "r", "views": 20, "frames": 2})
-        daemon.wait(lambda s: s["doing"])
+        daemon.wait(lambda s: log.exists())
         daemon.process.kill()
-        end = time.monotonic() + 8
-        while not log.exists() and time.monotonic() < end:
+        end = time.monotonic() + 20
+        while "stop" not in log.read_text():
+            assert time.monotonic() < end
             time.sleep(0.05)
-        assert "stop" in log.read_text()
 
 
 def test_only_one_daemon(daemon):
@@ -297,6 +387,8 @@ REFUSED = [
     ("wrong verb", "DELETE", "/v1/jobs", VERB, "{}", 405),
     ("no such job", "GET", "/v1/jobs/999999", {}, None, 404),
     ("a path for a picture", "GET", "/v1/preview/..%2f..%2ftoken", {}, None, 404),
+    ("no picture yet", "GET", "/v1/preview/depth", {}, None, 404),
+    ("no such picture", "GET", "/v1/preview/token", {}, None, 404),
     ("a word for an event", "GET", "/v1/events?after=x", {}, None, 400),
 ]
 

@@ -133,6 +133,29 @@ def test_systemd_hears_of_it(tmp_path):
     assert any("STATUS=idle" in line for line in heard)
 
 
+@pytest.mark.parametrize(
+    ("limit", "other", "period"),
+    [("20000000", 0, 10.0), ("20000000", 1, None), ("", 0, None), ("0", 0, None), ("soon", 0, None)],
+)
+def test_signs_of_life_come_twice_as_often_as_systemd_wants(monkeypatch, limit, other, period):
+    """Half the limit; none where systemd asks for none, or asks another process."""
+    from tofcapture.record.daemon.systemd import watchdog_period
+
+    monkeypatch.setenv("WATCHDOG_USEC", limit)
+    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid() + other))
+    assert watchdog_period() == period
+
+
+@pytest.mark.parametrize("flags", [(), ("--allow-motion",)])
+def test_motion_is_allowed_by_a_person_only(tmp_path, monkeypatch, flags):
+    """``tofcapture daemon`` lets a real arm move when it is told to, and not otherwise."""
+    pytest.importorskip("aiohttp")
+    served = []
+    monkeypatch.setattr("tofcapture.record.daemon.server.serve", lambda settings, *_: served.append(settings))
+    assert main(["daemon", "--root", str(tmp_path / "r"), "--state", str(tmp_path / "s"), *flags]) == 0
+    assert served[0].allow_motion == bool(flags)
+
+
 def test_cli_without_a_daemon(tmp_path, capsys):
     """``status`` and ``stop`` say that no daemon runs; the unit allows no motion."""
     assert main(["status", "--state", str(tmp_path)]) == 4
@@ -142,3 +165,4 @@ def test_cli_without_a_daemon(tmp_path, capsys):
     unit = capsys.readouterr().out
     assert "Type=notify" in unit
     assert "--allow-motion" not in unit
+    assert "WatchdogSec=20" in unit

@@ -81,6 +81,15 @@ def test_same_generator_same_plan(plan):
     assert _plan(seed=1).digest != plan.digest
 
 
+def test_a_plan_is_the_same_on_every_machine(plan):
+    """The digests of a seed's plan, of one of its views, and of given joints, as written into recordings."""
+    assert plan.digest == "b52a7dc8741f57ea"
+    assert plan.views[0].digest == "d416ac1406159bb2"
+    view = replace(plan.views[0], joints=np.array([0.1, -1.2, 1.3, 0.0, 0.5, -0.0]), turn=0.0)
+    assert view.digest == replace(view, joints=view.joints + 4e-7, distance=9.0).digest == "6ad404dbd3a45b3a"
+    assert replace(view, turn=np.pi / 2).digest == "62e31b2e5c57eda3"
+
+
 def test_shorter_plan_is_a_prefix(plan):
     """The first seven of 25 views are those of a plan for seven, so that a recording can be extended."""
     known = {v.index: v.digest for v in plan.views}
