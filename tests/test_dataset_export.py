@@ -186,12 +186,16 @@ def test_the_command(dataset, tmp_path, capsys):
 
 
 def test_png_is_what_a_decoder_reads():
-    """16-bit grey and 8-bit colour survive another library's decoder."""
+    """16-bit grey, 8-bit colour and colour tables survive another library's decoder."""
     grey = np.random.default_rng(0).integers(0, 65536, (7, 5), dtype=np.uint16)
     colour = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
     for image, back in ((grey, slice(None)), (colour, (..., slice(None, None, -1)))):
         data = np.frombuffer(png_bytes(image), np.uint8)
         assert (cv2.imdecode(data, cv2.IMREAD_UNCHANGED)[back] == image).all()
+    table = np.random.default_rng(1).integers(0, 256, (256, 3), dtype=np.uint8)
+    indices = (grey >> 8).astype(np.uint8)
+    data = np.frombuffer(png_bytes(indices, colours=table, level=9), np.uint8)
+    assert (cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1] == table[indices]).all()
 
 
 def test_a_lens_is_told_as_plumb_bob():

@@ -88,17 +88,28 @@ def test_planted_outliers_are_named():
 
 
 def test_the_page_and_the_command(dataset, tmp_path, capsys):
-    """The page needs nothing else; text and JSON say the same."""
+    """The page needs nothing else and shows the very numbers of the JSON, as the text does."""
+    pytest.importorskip("matplotlib")
     page = tmp_path / "page.html"
     assert main(["stats", str(dataset), "--html", str(page), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["splits"]["test"]["views"] == 2
     html = page.read_text(encoding="utf-8")
     assert "<script" not in html
-    assert not re.search(r'(src|href)="(?!data:)', html)
+    assert not re.search(r'(src|href)="(?!data:|#)', html)
     assert answer["manifest_sha256"] in html
-    assert html.count("<figure") == 4
+    assert html.count('<svg class="chart"') == 6
+    assert html.count("<figure><img") == 3 * 6  # a view of each scene, six pictures
     assert main(["stats", str(dataset)]) == 0
     text = capsys.readouterr().out
-    assert "gt_depth [m]" in text
-    assert "mask GOOD" in text
+    for split, said in answer["splits"].items():
+        for name, q in said["quantities"].items():
+            numbers = [f"{q[k]:.4g}" for k in ("min", "p1", "p50", "p99", "max")]
+            row = [f"{name} [{q['unit']}]", split, f"{q['count']:,}", *numbers]
+            assert "".join(f"<td>{cell}</td>" for cell in row) in html
+            assert " ".join(row) in " ".join(text.split())
+    for kind in ("mask", "flags"):
+        for name in answer["splits"]["train"][kind]:
+            shares = [f"{said[kind][name]:.2%}" for said in answer["splits"].values()]
+            assert f"<td>{kind} {name}</td>" + "".join(f"<td>{s}</td>" for s in shares) in html
+            assert " ".join([kind, name, *shares]) in " ".join(text.split())

@@ -11,7 +11,7 @@ import pytest
 from tests.test_dataset_build import CONFIG, rng, simulate, true_rig
 from tests.test_files_shard import write
 from tofcapture.cli import main
-from tofcapture.cli.figure import KINDS
+from tofcapture.colours import percentile, round_up
 from tofcapture.dataset.sample import make_sample
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
@@ -19,11 +19,9 @@ from tofcapture.files.maps import GroundTruth
 from tofcapture.files.view import view_path, write_view
 from tofcapture.poses import look_at
 from tofcapture.rig import dumps_rig
-from tofcapture.viz.figures import write as figures
-from tofcapture.viz.figures.clouds import splat, stage_for
+from tofcapture.viz.clouds import eye_for, splat
 from tofcapture.viz.figures.preprocessing import gap, preprocess
-from tofcapture.viz.figures.rows import Maps, object_window, read_rows
-from tofcapture.viz.figures.table import Scale, percentile, round_up
+from tofcapture.viz.figures.scenes import Maps, object_window, read_rows
 
 pytest.importorskip("matplotlib")
 
@@ -111,11 +109,6 @@ def test_files_are_the_same_each_run(form, start, dataset, tmp_path):
     assert made[0] == made[1]
 
 
-def test_kinds_of_the_command_are_those_of_the_figures():
-    """The light list and the drawing agree."""
-    assert KINDS == figures.KINDS
-
-
 def test_help_does_not_import_matplotlib():
     """Neither the command nor its help loads matplotlib or h5py."""
     code = (
@@ -147,9 +140,11 @@ def test_a_perfect_prediction_has_no_error(dataset):
     assert [row.name.split()[0] for row in rows] == ["box", "mug"]
     for row in rows:
         assert np.nanmax(np.abs(row.prediction.error_mm)) == 0
-        left, right, top, bottom = object_window(row)
-        assert 0 <= left < right <= row.camera.width
-        assert 0 <= top < bottom <= row.camera.height
+        rows, columns = object_window(row.truth.mask == 0)
+        inside = np.zeros(row.truth.mask.shape, bool)
+        inside[rows, columns] = True
+        assert inside[row.truth.mask == 0].all()
+        assert row.shown(row.amplitude).shape == tuple((s.stop - s.start) // 2 for s in (rows, columns))
 
 
 def test_scales_end_at_round_numbers():
@@ -158,7 +153,6 @@ def test_scales_end_at_round_numbers():
         assert value <= round_up(value) <= 1.7 * value
     assert round_up(0.0) == round_up(float("nan")) == 1.0
     assert percentile([np.array([np.nan])], 50, 3.0) == 3.0
-    assert Scale("cividis", 0, 4, "", gamma=0.5).norm()(1.0) == pytest.approx(0.5)
 
 
 def test_nearer_points_cover_farther_ones():
@@ -166,25 +160,25 @@ def test_nearer_points_cover_farther_ones():
     T = look_at(np.array([0.5, 0.0, 1.0]), np.zeros(3))
     x, y = np.meshgrid(np.linspace(-0.1, 0.1, 80), np.linspace(-0.1, 0.1, 80))
     sheet = np.stack([x, y, np.full_like(x, 1.1)], axis=-1).reshape(-1, 3)
-    stage = stage_for(sheet, T)
-    away = np.linalg.inv(stage.T_eye_tof)[:3, 2]
+    eye = eye_for(sheet, T)
+    away = np.linalg.inv(eye.T_eye_tof)[:3, 2]
     near, far = (sheet, (255, 0, 0)), (sheet + 0.05 * away, (0, 0, 255))
     for clouds in ([near, far], [far, near]):
-        image = splat(clouds, stage, 60, 3)
+        image = splat(clouds, eye, 60, 3)
         middle = image[20:26, 27:33].reshape(-1, 3)
         assert (middle[:, 0] > 0).all()
         assert (middle[:, 2] == 0).all()
-    assert (splat([(np.full((3, 3), np.nan), (0, 0, 0))], stage, 60) == 255).all()
+    assert (splat([(np.full((3, 3), np.nan), (0, 0, 0))], eye, 60) == 255).all()
 
 
 def test_up_is_up():
     """What is higher in the base frame is higher in the picture, and left stays left of the eye's own axes."""
     T = look_at(np.array([0.5, 0.2, 1.0]), np.zeros(3))
-    stage = stage_for(np.zeros((1, 3)), T)
-    up_eye = stage.T_eye_tof[:3, :3] @ T[:3, :3].T @ [0, 0, 1]
+    eye = eye_for(np.zeros((1, 3)), T)
+    up_eye = eye.T_eye_tof[:3, :3] @ T[:3, :3].T @ [0, 0, 1]
     assert up_eye[1] < -0.9
     assert up_eye[0] == pytest.approx(0, abs=1e-12)
-    assert np.linalg.det(stage.T_eye_tof[:3, :3]) == pytest.approx(1)
+    assert np.linalg.det(eye.T_eye_tof[:3, :3]) == pytest.approx(1)
 
 
 def test_preprocessing_is_what_the_dataset_keeps(view):
@@ -193,8 +187,8 @@ def test_preprocessing_is_what_the_dataset_keeps(view):
     steps = preprocess(view, rig)
     sample = make_sample(view, rig, CONFIG, rng())
     native = int(np.isfinite(sample.native_depth).sum())
-    assert abs(len(steps.denoised) - native) <= 0.02 * native
-    assert len(steps.denoised) + len(steps.removed) == len(steps.cropped)
+    assert abs(len(steps.kept) - native) <= 0.02 * native
+    assert 0 < len(steps.removed) < len(steps.kept)
     assert steps.after < steps.before
     tof = rig.tof.unproject(np.full(rig.tof.shape, 0.5))
     assert gap(tof.reshape(-1, 3), tof[..., 2] + 0.01, rig) == pytest.approx(0.01)

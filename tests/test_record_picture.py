@@ -11,8 +11,8 @@ from tests.test_plan import RIG, STAGE, UR10E
 from tofcapture.cli import main
 from tofcapture.errors import BusyError, DeviceError
 from tofcapture.record.daemon import client
-from tofcapture.record.picture import plan_svg
-from tofcapture.record.plan import FATES, object_sampling, plan_views
+from tofcapture.record.plan import FATES, REMEDIES, object_sampling, plan_views
+from tofcapture.viz.plan import write_plan
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -23,24 +23,49 @@ def _plan(views=9, turns=1, stage=STAGE, distances=(0.4, 0.7, 1.2), tilt=(0.0, 1
     return plan_views(UR10E, RIG, stage, stage.target, sampling, views, rng, turns)
 
 
-def _drawn(plan, stage=STAGE, title="mug <1>"):
-    return ET.fromstring(plan_svg(plan, stage, RIG, stage.target, title))  # noqa: S314  ours
+def _drawn(plan, tmp_path, stage=STAGE, title="mug <1>"):
+    out = tmp_path / "plan.svg"
+    write_plan(plan, stage, RIG, stage.target, title, out)
+    return ET.fromstring(out.read_text())  # noqa: S314  ours
 
 
-def test_every_view_and_every_reason_is_drawn():
-    """Each view stands in both panels with its number; the counts of the legend are those of the plan."""
-    plan = _plan()
-    root = _drawn(plan)
+def test_every_view_and_every_reason_is_drawn(tmp_path):
+    """Each view stands in both panels with its number, place and words; the counts of the legend are those of the plan."""
+    plan = _plan(turns=2)
+    root = _drawn(plan, tmp_path)
     views = [g for g in root.iter(f"{SVG}g") if g.get("class") == "view"]
-    numbers = sorted(int(g.find(f"{SVG}text").text) for g in views)
-    assert numbers == sorted(2 * list(range(9)))
-    words = " ".join(t.text or "" for t in root.iter(f"{SVG}text"))
-    assert "mug <1>" in words
-    for count in (n for n in plan.refused.values() if n):
-        assert str(count) in words
-    low, high = 0.0, float(root.get("viewBox").split()[2])
-    for circle in root.iter(f"{SVG}circle"):
-        assert low <= float(circle.get("cx")) <= high
+    titles = sorted(g.find(f"{SVG}title").text for g in views)
+    said = [
+        f"view {v.index}: {v.distance:.2f} m, object turned by {np.degrees(v.turn):.0f} deg"
+        for v in plan.views
+    ]
+    assert titles == sorted(2 * said)
+    words = [t.text or "" for t in root.iter(f"{SVG}text")]
+    assert any("mug <1>" in w and plan.summary() in w for w in words)
+    for view in plan.views:
+        assert words.count(f"{view.index}") == 2
+    for reason, count in plan.refused.items():
+        assert (f"{count} {REMEDIES[reason][0]}" in words) == (count > 0)
+    assert {"object turned by 0 deg", "object turned by 180 deg"} <= set(words)
+
+
+def test_views_are_drawn_to_scale(tmp_path):
+    """The cameras stand in the picture from above as they stand in the room: x to the right, y up, one scale."""
+    plan = _plan()
+    groups = [g for g in _drawn(plan, tmp_path).iter(f"{SVG}g") if g.get("class") == "view"][
+        : len(plan.views)
+    ]
+    pixels = np.array([_start(g) for g in groups])
+    room = np.stack([(v.T_base_flange @ RIG.T_flange_tof)[:2, 3] for v in plan.views])
+    (right, _), (up, _) = (np.polyfit(room[:, k], pixels[:, k], 1) for k in (0, 1))
+    assert right > 0
+    assert up == pytest.approx(-right, rel=1e-4)
+    np.testing.assert_allclose(np.diff(pixels, axis=0), np.diff(room, axis=0) * [right, up], atol=0.01)
+
+
+def _start(group):
+    """First point of a view's line: the camera itself."""
+    return [float(x) for x in group.find(f"{SVG}path").get("d").split()[1:3]]
 
 
 def test_fates_and_counts_agree():
@@ -55,11 +80,11 @@ def test_fates_and_counts_agree():
         assert np.linalg.norm(free - spot, axis=1).min() < 1e-9
 
 
-def test_an_empty_plan_is_drawn_and_explained():
+def test_an_empty_plan_is_drawn_and_explained(tmp_path):
     """Where nothing can be reached the picture still says why, and the words name reason and remedy."""
     far = replace(STAGE, target=np.array([4.0, 0.0, -0.4]))
     plan = _plan(stage=far)
-    assert not [g for g in _drawn(plan, far).iter(f"{SVG}g") if g.get("class") == "view"]
+    assert not [g for g in _drawn(plan, tmp_path, far).iter(f"{SVG}g") if g.get("class") == "view"]
     lines = plan.shortfall()
     assert "only 0 of 9 views" in lines[0]
     assert "240 are beyond the arm's reach" in lines[1]
@@ -99,7 +124,7 @@ def test_dry_run_draws_beside_the_recording(tmp_path, capsys):
     assert "3 of 3 views" in said
     assert "tilt" in said
     assert not out.exists()
-    assert (tmp_path / "r-mug-plan.svg").read_text().startswith("<svg")
+    assert (tmp_path / "r-mug-plan.svg").read_text().startswith("<?xml")
     assert main([*words, "--picture", str(tmp_path / "p" / "x.svg"), "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["picture"].endswith("x.svg")

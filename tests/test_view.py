@@ -9,15 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.test_files_shard import RIG, write
 from tofcapture.cli import main
+from tofcapture.colours import GOOD, GREY, MASK, Scale, palette, scale_for
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
 from tofcapture.rig import dumps_rig
 from tofcapture.viz import open_source
-from tofcapture.viz.colours import GOOD, GREY, MASK, limits, paint
-from tofcapture.viz.shots import Panel, Shot, Source
+from tofcapture.viz.shots import Panel, Shot, Source, scales_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
@@ -104,16 +106,47 @@ def test_shots_of_a_shard_are_its_arrays(dataset):
 
 def test_colours_say_what_they_mean():
     """No value is grey, zero error is white, the gravest mask bit wins, signed scales are symmetric."""
-    error = Panel("e", "error", np.array([[0.0, 0.01], [-0.002, np.nan]]))
-    low, high = limits([error])
-    assert low == -high
-    image = paint(error, low, high).image
+    error = Panel("e", "error", np.array([[0.0, 10.0], [-2.0, np.nan]]))
+    scale = scales_of([error])["error"]
+    assert (scale.low, scale.unit) == (-scale.high, "mm")
+    image = error.paint(scale)
     assert tuple(image[1, 1]) == GREY
     assert image[0, 0].min() > 240
-    assert paint(error, low, high).unit == "mm"
-    mask = Panel("m", "mask", np.array([[0, MaskBit.EDGE | MaskBit.NOT_HIT]], np.uint8))
-    assert tuple(paint(mask, 0, 1).image[0, 0]) == GOOD
-    assert tuple(paint(mask, 0, 1).image[0, 1]) == MASK[MaskBit.NOT_HIT]
+    mask = Panel("m", "mask", np.array([[0, MaskBit.EDGE | MaskBit.NOT_HIT]], np.uint8)).paint(None)
+    assert tuple(mask[0, 0]) == GOOD[0]
+    assert tuple(mask[0, 1]) == MASK[MaskBit.NOT_HIT][0]
+
+
+@pytest.mark.parametrize("name", ["viridis", "cividis", "magma", "RdBu_r"])
+def test_palettes_are_those_of_matplotlib(name):
+    """The map that a scale names is the one that everybody knows, to a few of 255 levels; the last colour is grey."""
+    known = pytest.importorskip("matplotlib").colormaps[name].resampled(255)(np.arange(255), bytes=True)
+    found = palette(name)
+    assert np.abs(found[:-1].astype(int) - known[:, :3]).max() <= 12
+    assert tuple(found[-1]) == GREY
+
+
+@given(st.floats(-1e3, 1e3), st.floats(1e-3, 1e3), st.sampled_from([1.0, 0.5]))
+@settings(max_examples=30, deadline=None)
+def test_a_scale_spans_its_colours(low, span, gamma):
+    """The ends have the first and the last colour, beyond them nothing changes, NaN is grey."""
+    scale = Scale("viridis", low, low + span, "mm", gamma)
+    values = np.array([[low, low + span, low - 1, low + span + 1, np.nan]])
+    assert scale.indices(values).tolist() == [[0, 254, 0, 254, 255]]
+    assert len(scale.ticks) == 5
+
+
+def test_the_depth_scale_shows_the_object():
+    """Where the object is known the scale is about it, whatever stands behind; else it leaves out the far quarter."""
+    depth = np.linspace(0.5, 3.0, 10_000).reshape(100, 100)
+    about = scale_for("depth", [depth], [(depth > 0.70) & (depth < 0.80)])
+    assert 0.66 < about.low < 0.70
+    assert 0.80 < about.high < 0.84
+    everything = scale_for("depth", [depth])
+    assert everything.low < 0.6
+    assert 2.2 < everything.high < 2.5
+    nothing = scale_for("depth", [np.full((3, 3), np.nan)], [np.zeros((3, 3), bool)])
+    assert nothing.low < nothing.high
 
 
 def test_views_are_thinned_evenly():

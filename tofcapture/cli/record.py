@@ -147,15 +147,14 @@ def _handed_over(args: argparse.Namespace, scene: str, views: int) -> Outcome | 
 def _planned(args: argparse.Namespace, scene: str, station: Station, plan: Plan) -> Outcome:
     """Print the plan, draw it."""
     from tofcapture.devices.clearance import stage_of
-    from tofcapture.files.seal import write_text
-    from tofcapture.record.picture import plan_svg
+    from tofcapture.viz.plan import write_plan
 
     stage = stage_of(station.config)
     picture = args.picture or args.out.parent / f"{args.out.name}-{scene}-plan.svg"
     target = stage.board if args.calibration else stage.target
     title = f"{scene}: {len(plan.views)} views, {station.arm.describe().model}"
     picture.parent.mkdir(parents=True, exist_ok=True)
-    write_text(picture, plan_svg(plan, stage, station.rig, target, title))
+    write_plan(plan, stage, station.rig, target, title, picture)
     return Outcome(
         data={"ok": True, "scene": scene, "plan": plan.table(), "picture": str(picture)},
         text="\n".join([plan.summary(), *_plan_rows(plan), *plan.shortfall(), f"drawn in {picture}"]),

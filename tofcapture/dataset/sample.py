@@ -104,7 +104,7 @@ def make_sample(
     native = np.where(denoise(measured, rig.stereo), measured, np.float32(np.nan))
     sheet = triangulate(native, rig.stereo)
     field = PlaneField(np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
-    crop = find_crop(_sparse_points(native, rig), T_base_tof[2, :3], rng, config.crop_radius, config.far)
+    crop = find_object(native, rig, T_base_tof, config, rng)
     truths = {}
     for scale in config.scales:
         camera = rig.tof.scaled(scale)
@@ -156,10 +156,13 @@ def _decoder(info: str, thread: int) -> Decoder:  # noqa: ARG001  a decoder's bu
     return Decoder(tof_from(json.loads(info), "tof_info"))
 
 
-def _sparse_points(native: NDArray[np.float32], rig: Rig) -> Float64:
-    """Every fourth stereo point of every fourth row, ToF frame: enough to find a table."""
+def find_object(
+    native: NDArray[np.float32], rig: Rig, T_base_tof: Float64, config: SampleConfig, rng: np.random.Generator
+) -> Crop:
+    """Find the table, and so the object on it, in every fourth point of every fourth row of stereo depth (SH, SW)."""
     points = native[::SPARSE, ::SPARSE, None] * rig.stereo.rays[::SPARSE, ::SPARSE]
-    return transform_points(rig.T_tof_stereo, points)
+    points = transform_points(rig.T_tof_stereo, points)
+    return find_crop(points, T_base_tof[2, :3], rng, config.crop_radius, config.far)
 
 
 def smoothed(projection: Projection, field: PlaneField, rig: Rig, camera: Camera) -> Projection:

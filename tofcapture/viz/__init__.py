@@ -1,4 +1,4 @@
-"""What is looked at: recordings, views, shards, datasets, predictions and calibrations, in Rerun or on a contact sheet.
+"""Draw whatever people look at: recordings, shards and calibrations in Rerun or on a sheet, figures, plans and pages.
 
 Each kind of file becomes a :class:`tofcapture.viz.shots.Source` of shots; the Rerun recording and the sheet know shots only.
 """

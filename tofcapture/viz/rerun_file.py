@@ -1,4 +1,4 @@
-"""A source as a Rerun recording with a blueprint. The only module that speaks to Rerun's library, whose calls change often."""
+"""Write a source as a Rerun recording with a blueprint: the only module that speaks to Rerun's library, which changes often."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from tofcapture.errors import ConfigError
 from tofcapture.files.seal import replacing
 from tofcapture.poses import Float64, invert
 from tofcapture.rig import Rig
-from tofcapture.viz.colours import limits, paint
-from tofcapture.viz.shots import Shot, Source
+from tofcapture.viz.shots import Shot, Source, scales_of
 
 _TIMELINE = "view"
 _POINT = 0.0012  # m, radius of a drawn point
@@ -21,14 +20,7 @@ _FRUSTUM = 0.08  # m, length of a drawn camera
 _COLUMNS = 3
 
 
-def load_rerun() -> Any:
-    """Import Rerun.
-
-    Raises
-    ------
-    ConfigError
-        It is not installed.
-    """
+def _load_rerun() -> Any:
     try:
         import rerun
     except ImportError as err:
@@ -62,9 +54,9 @@ def write_rrd(source: Source, path: Path, most: int, progress: Callable[[int, in
     ConfigError
         Rerun is not installed.
     """
-    rr = load_rerun()
+    rr = _load_rerun()
     picked = source.spread(most)
-    titles = _titles(source.load(picked[0])) if picked else []
+    titles = [panel.title for panel in source.load(picked[0]).panels] if picked else []
     with replacing(path) as partial:
         stream = rr.RecordingStream("tofcapture", send_properties=False)
         stream.save(str(partial), default_blueprint=_blueprint(source, titles))
@@ -80,26 +72,21 @@ def write_rrd(source: Source, path: Path, most: int, progress: Callable[[int, in
     return len(picked)
 
 
-def _titles(shot: Shot) -> list[tuple[str, str]]:
-    return [(f"images/{i}", p.title) for i, p in enumerate(shot.panels)]
-
-
-def _blueprint(source: Source, images: list[tuple[str, str]]) -> Any:
+def _blueprint(source: Source, titles: list[str]) -> Any:
     """Arrange the space on the left; pictures on the right; words above them; the timeline stands open."""
-    load_rerun()
     import rerun.blueprint as rrb
 
     space = rrb.Spatial3DView(origin="/base", name="arm, cameras, points (m)")
     words = rrb.TextDocumentView(origin="/words", name=source.title)
-    if images:
-        pictures = [rrb.Spatial2DView(origin=f"/{at}", name=title) for at, title in images]
+    if titles:
+        pictures = [rrb.Spatial2DView(origin=f"/images/{i}", name=title) for i, title in enumerate(titles)]
         columns = min(_COLUMNS, max(1, len(pictures) // 2))
         right = rrb.Vertical(words, rrb.Grid(*pictures, grid_columns=columns), row_shares=[1, 5])
     else:
         right = rrb.Vertical(words, rrb.BarChartView(origin="/pairs", name="RMSE of every pair (mm)"))
     return rrb.Blueprint(
         rrb.Horizontal(space, right, column_shares=[2, 3]),
-        rrb.TimePanel(state="expanded" if images else "hidden", timeline=_TIMELINE, play_state="paused"),
+        rrb.TimePanel(state="expanded" if titles else "hidden", timeline=_TIMELINE, play_state="paused"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         auto_views=False,
@@ -120,10 +107,11 @@ def _log_shot(rr: Any, stream: Any, shot: Shot, rig: Rig | None) -> None:
     for name, cloud in shot.clouds.items():
         stream.log(f"base/tof/{name}", rr.Points3D(cloud.points, colors=cloud.colour, radii=_POINT))
     words = [f"### {shot.name}"]
+    scales = scales_of(shot.panels)
     for i, panel in enumerate(shot.panels):
-        painted = paint(panel, *limits([panel]))
-        stream.log(f"images/{i}", rr.Image(painted.image))
-        words.append(f"- {panel.title}{': ' if painted.legend else ''}{painted.legend}")
+        scale = scales.get(panel.kind)
+        stream.log(f"images/{i}", rr.Image(panel.paint(scale)))
+        words.append(f"- {panel.title}{f': {scale.words}' if scale else ''}")
     words.append(
         "- points: orange the sensor, blue ground truth or stereo, green an estimate; grey pixels: none"
     )

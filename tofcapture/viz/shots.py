@@ -1,4 +1,4 @@
-"""A shot: what one view, one shard's view or one prediction has to show, whatever file it came from."""
+"""Hold what one view, one shard's view or one prediction has to show, whatever file it came from."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.colours import Kind as ScaleKind
+from tofcapture.colours import Scale, UInt8, mask_classes, mask_colours, paint_normals, scale_for
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig
 
-PanelKind = Literal["depth", "amplitude", "error", "expected", "normals", "mask"]
+Kind = Literal[ScaleKind, "normals", "mask"]
 
 
 @dataclass(frozen=True)
@@ -24,15 +26,27 @@ class Panel:
     title
         Few words.
     kind
-        Decides colours and unit: ``depth`` metres; ``amplitude`` raw units; ``error`` signed and ``expected`` unsigned, both
-        metres here and printed in millimetres; ``normals`` unit vectors; ``mask`` bits of ground truth.
+        Decides colours and unit: ``depth`` metres, ``amplitude`` raw units, ``error`` signed and ``expected`` unsigned
+        millimetres, ``normals`` unit vectors, ``mask`` bits of ground truth.
     values
-        (H, W), or (H, W, 3) for normals; NaN: none.
+        (H, W) in that unit, or (H, W, 3) for normals; NaN: none.
+    on_object
+        (H, W), where the object is; ``None``: unknown.
     """
 
     title: str
-    kind: PanelKind
+    kind: Kind
     values: NDArray[Any]
+    on_object: NDArray[np.bool_] | None = None
+
+    def paint(self, scale: Scale | None) -> UInt8:
+        """(H, W, 3) colours; normals and masks need no scale."""
+        if self.kind == "normals":
+            return paint_normals(self.values)
+        if scale is None:
+            painted: UInt8 = mask_colours()[mask_classes(self.values)]
+            return painted
+        return scale.paint(self.values)
 
 
 @dataclass(frozen=True)
@@ -104,3 +118,13 @@ class Source:
         """Numbers of at most ``most`` shots, spread evenly over all."""
         n = len(self.names)
         return list(range(n)) if n <= most else [round(i) for i in np.linspace(0, n - 1, most)]
+
+
+def scales_of(panels: Sequence[Panel]) -> dict[str, Scale]:
+    """Scale of every kind that has one; panels of one kind share it, so that they can be compared."""
+    scales = {}
+    for kind in {p.kind for p in panels} - {"normals", "mask"}:
+        alike = sorted((p for p in panels if p.kind == kind), key=lambda p: p.on_object is None)
+        objects = [p.on_object for p in alike if p.on_object is not None]
+        scales[kind] = scale_for(kind, [p.values for p in alike], objects)
+    return scales

@@ -1,8 +1,7 @@
-"""Show a Rerun file: in Rerun's window, or in a browser of this machine.
+"""Show a Rerun file in Rerun's window, or in a browser of this machine.
 
-Rerun by itself listens on every interface and reports how it is used, its page from the browser too. Here its window gets a
-configuration of its own that says no, and its page is served by us: on the loopback interface, with a policy that lets the browser
-ask nobody else.
+Rerun by itself listens on every interface and reports how it is used. Here its window gets a configuration that says no.
+Its page is served by us on the loopback interface, with a policy that lets the browser ask nobody else.
 """
 
 from __future__ import annotations
@@ -55,13 +54,7 @@ def _program() -> str:
 
 
 def quiet_environment(folder: Path) -> dict[str, str]:
-    """Environment in which Rerun reports nothing.
-
-    Parameters
-    ----------
-    folder
-        An empty folder, in which its configuration is put.
-    """
+    """Environment in which Rerun reports nothing; its configuration is put into an empty folder."""
     config = folder / "rerun" / "analytics.json"
     config.parent.mkdir(parents=True)
     config.write_text(
@@ -72,11 +65,6 @@ def quiet_environment(folder: Path) -> dict[str, str]:
 
 def show_window(rrd: Path) -> None:
     """Show a file in Rerun's window until it is closed.
-
-    Parameters
-    ----------
-    rrd
-        What to show.
 
     Raises
     ------
@@ -105,7 +93,7 @@ def _free_port() -> int:
 
 
 def page_files() -> dict[str, bytes]:
-    """Rerun's page as its own server hands it out: path -> bytes, without what it would load from elsewhere.
+    """Take Rerun's page from its own server: path -> bytes, without what it would load from elsewhere.
 
     Raises
     ------
@@ -116,18 +104,9 @@ def page_files() -> dict[str, bytes]:
     """
     with tempfile.TemporaryDirectory(prefix="tofcapture-view-") as folder:
         port = _free_port()
-        words = [
-            _program(),
-            "--bind",
-            LOOPBACK,
-            "--port",
-            str(_free_port()),
-            "--serve-web",
-            "--web-viewer-port",
-            str(port),
-        ]
+        bound = ("--bind", LOOPBACK, "--port", str(_free_port()))
         process = subprocess.Popen(
-            words,
+            [_program(), *bound, "--serve-web", "--web-viewer-port", str(port)],
             env=quiet_environment(Path(folder)),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -171,13 +150,8 @@ class _Page(BaseHTTPRequestHandler):
             return
         path, _, query = self.path.partition("?")
         if path == "/" and not query:
-            self._answer(
-                303,
-                b"",
-                {
-                    "Location": f"/?url=http://{self.headers['Host']}{_DATA}&hide_welcome_screen&notebook=0&persist=0"
-                },
-            )
+            data = f"http://{self.headers['Host']}{_DATA}"
+            self._answer(303, b"", {"Location": f"/?url={data}&hide_welcome_screen&notebook=0&persist=0"})
         elif path == _DATA:
             self._answer(200, self.rrd.read_bytes(), {"Content-Type": "application/octet-stream"})
         elif (name := "/index.html" if path == "/" else path) in self.files:
@@ -187,11 +161,8 @@ class _Page(BaseHTTPRequestHandler):
 
     def _answer(self, code: int, body: bytes, headers: Mapping[str, str]) -> None:
         self.send_response(code)
-        for name, value in {
-            **headers,
-            "Content-Length": str(len(body)),
-            "Content-Security-Policy": _POLICY,
-        }.items():
+        always = {"Content-Length": str(len(body)), "Content-Security-Policy": _POLICY}
+        for name, value in {**headers, **always}.items():
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body)
@@ -201,14 +172,7 @@ class _Page(BaseHTTPRequestHandler):
 
 
 def make_server(rrd: Path, port: int = PORT) -> ThreadingHTTPServer:
-    """Server of the page on the loopback interface; ``server_port`` says where.
-
-    Parameters
-    ----------
-    rrd
-        What it shows.
-    port
-        Wanted; another one is taken when it is not free.
+    """Server of the page of a file on the loopback interface; another port is taken where the wanted one is not free.
 
     Raises
     ------
@@ -223,22 +187,8 @@ def make_server(rrd: Path, port: int = PORT) -> ThreadingHTTPServer:
 
 
 def show_page(rrd: Path) -> None:
-    """Serve the page until Ctrl-C, and say where.
-
-    Parameters
-    ----------
-    rrd
-        What it shows.
-
-    Raises
-    ------
-    ConfigError
-        Rerun is not installed.
-    """
+    """Serve the page of a file until Ctrl-C, and say where."""
     with make_server(rrd) as server:
-        print(
-            f"open http://{LOOPBACK}:{server.server_port} in a browser of this machine; Ctrl-C ends",
-            file=sys.stderr,
-            flush=True,
-        )
+        where = f"http://{LOOPBACK}:{server.server_port}"
+        print(f"open {where} in a browser of this machine; Ctrl-C ends", file=sys.stderr, flush=True)
         server.serve_forever()

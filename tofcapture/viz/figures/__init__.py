@@ -1,0 +1,83 @@
+"""Draw figures for papers and slides from data: the same input gives the same bytes.
+
+::
+
+    write_figure("depth", Path("datasets/first"), Path("depth.pdf"), Choice(rows=3))
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tofcapture.errors import UsageError
+from tofcapture.viz.charts import METADATA, canvas, save
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What of a path is drawn.
+
+    Attributes
+    ----------
+    scene
+        Name; ``None``: the first one, or as many as there are rows.
+    view
+        In a recording the number in the view's file name; in a shard the number in the shard. ``None``: the first.
+    rows
+        Largest number of scenes.
+    prediction
+        Folder that ``predict`` wrote, or one of such folders, named by scene.
+    rig
+        ``rig.toml`` to use instead of the recording's.
+    """
+
+    scene: str | None = None
+    view: int | None = None
+    rows: int = 4
+    prediction: Path | None = None
+    rig: Path | None = None
+
+
+def write_figure(kind: str, path: Path, out: Path, choice: Choice) -> str:
+    """Draw a figure 1200 pixels wide.
+
+    Parameters
+    ----------
+    kind
+        ``acquisition``, ``preprocessing``, ``depth`` or ``normals``.
+    path
+        Recording for the first, view file or recording for the second, dataset or shard for the others.
+    out
+        Of the figure: ``.png``, ``.pdf`` or ``.svg``; replaced when it exists, and left alone when drawing fails.
+    choice
+        What of it.
+
+    Returns
+    -------
+    What is on it, in words.
+
+    Raises
+    ------
+    UsageError
+        The ending is unknown.
+    DataError, FormatError
+        The data are missing, damaged, or not what this kind of figure shows.
+    """
+    from tofcapture.viz.figures.acquisition import draw_acquisition
+    from tofcapture.viz.figures.preprocessing import draw_preprocessing
+    from tofcapture.viz.figures.scenes import draw_rows, read_rows
+
+    form = out.suffix.removeprefix(".").lower()
+    if form not in METADATA:
+        raise UsageError(f"{out}: expected a name that ends in .png, .pdf or .svg", hint="--out figure.png")
+    with canvas() as figure:
+        if kind == "acquisition":
+            words = draw_acquisition(figure, path, choice.scene, choice.view)
+        elif kind == "preprocessing":
+            words = draw_preprocessing(figure, path, choice.scene, choice.view, choice.rig)
+        else:
+            rows = read_rows(path, choice.scene, choice.view or 0, choice.rows, choice.prediction)
+            words = draw_rows(figure, kind, rows)
+        save(figure, out, form)
+    return words

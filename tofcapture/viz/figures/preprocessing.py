@@ -1,34 +1,30 @@
-"""From what was captured to ground truth: the clouds of one view, step by step."""
+"""Draw the way from what was captured to ground truth: the clouds of one view, step by step."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.colours import GROUND_TRUTH, REMOVED, SENSOR
+from tofcapture.dataset.sample import SampleConfig, calibrated, check_cameras, decode_burst, find_object
 from tofcapture.errors import DataError
 from tofcapture.files.view import read_view
 from tofcapture.frames import View
-from tofcapture.ops.crop import crop_depth, find_crop
+from tofcapture.ops.crop import crop_depth
 from tofcapture.ops.denoise import denoise
-from tofcapture.ops.phase import Decoder
 from tofcapture.poses import Float64, transform_points
 from tofcapture.rig import Rig, load_rig
-from tofcapture.viz.colours import GROUND_TRUTH, SENSOR
-from tofcapture.viz.figures.clouds import splat, stage_for
-from tofcapture.viz.figures.recording import pick_view
-from tofcapture.viz.figures.table import Cell, Column, draw_table
+from tofcapture.viz.captured import pick_view
+from tofcapture.viz.clouds import Eye, eye_for, splat
+from tofcapture.viz.table import Cell, Column, draw_table
 
-FAR = 2.0  # m; what lies beyond is no object
-RADIUS = 0.35  # m around what the camera looks at, along the table
-REMOVED = (213, 94, 0)  # vermilion
-_SPARSE = 4  # pixels of the stereo grid between points that vote for the table
-_ASPECT = 1.0
-_WIDTH = 480  # pixels of a cloud's picture
+_CONFIG = SampleConfig()
 _AROUND = 2.5  # radii of the object that are shown around it before it is cropped
+_TOF, _STEREO, _NOISE = (SENSOR, "ToF"), (GROUND_TRUTH, "stereo"), (REMOVED, "noise to be removed")
 
 
 @dataclass(frozen=True)
@@ -39,11 +35,10 @@ class Steps:
     ----------
     tof
         Everything that the sensor decoded.
-    captured, aligned, cropped, denoised
-        Stereo with the rig that the view was taken with, with the calibrated one, what the crop keeps, and of that what
-        denoising keeps.
-    removed
-        What denoising takes out.
+    captured, aligned
+        Stereo with the rig that the view was taken with, and with the calibrated one.
+    kept, removed
+        What the crop keeps of the object, and what of that denoising takes out.
     before, after
         Median of the distance in depth between both clouds at the sensor's pixels, metres.
     """
@@ -51,8 +46,7 @@ class Steps:
     tof: Float64
     captured: Float64
     aligned: Float64
-    cropped: Float64
-    denoised: Float64
+    kept: Float64
     removed: Float64
     before: float
     after: float
@@ -88,20 +82,17 @@ def draw_preprocessing(figure: Any, path: Path, scene: str | None, view: int | N
             f"{chosen}: no calibrated rig: {used} does not exist",
             hint="tofcapture align RECORDING, or --rig rig.toml",
         )
-    found = read_view(chosen)
-    calibrated = load_rig(used)
-    steps = preprocess(found, calibrated)
-    T = found.arm_before.T_base_flange @ calibrated.T_flange_tof
+    found, constants = read_view(chosen), load_rig(used)
+    steps = preprocess(found, constants)
+    T = found.arm_before.T_base_flange @ constants.T_flange_tof
     name = f"{found.scene} {found.index}"
-    draw_table(figure, f"Pre-processing of {name}", [""], _columns(steps, T), _ASPECT)
-    words = (
-        f"{name}: clouds {1e3 * steps.before:.2f} mm apart before, {1e3 * steps.after:.2f} mm after alignment"
-    )
-    return f"{words}; {len(steps.denoised)} points kept, {len(steps.removed)} removed as noise"
+    draw_table(figure, f"Pre-processing of {name}", [""], _columns(steps, T), 1.0)
+    gaps = f"clouds {1e3 * steps.before:.2f} mm apart before, {1e3 * steps.after:.2f} mm after alignment"
+    return f"{name}: {gaps}; {len(steps.kept)} points kept, {len(steps.removed)} removed as noise"
 
 
 def preprocess(view: View, rig: Rig) -> Steps:
-    """Align, crop and denoise a view.
+    """Align, crop and denoise a view with the stages of the dataset.
 
     Parameters
     ----------
@@ -115,55 +106,35 @@ def preprocess(view: View, rig: Rig) -> Steps:
     DataError
         The rig is of other cameras, or nothing is left.
     """
-    for name, found, expected in (
-        ("ToF", view.tof.info.camera.shape, rig.tof.shape),
-        ("stereo", view.stereo.info.camera.shape, rig.stereo.shape),
-    ):
-        if found != expected:
-            raise DataError(
-                f"{view.scene} {view.index}: expected {name} images of {expected} as the rig says, got {found}",
-                hint="is it the rig of another station?",
-            )
-    tof, depth = _decoded(view, rig), view.stereo.points[..., 2]
-    keep = denoise(np.ascontiguousarray(depth), rig.stereo)
-    clean = np.where(keep, depth, np.float32(np.nan))
-    sparse = clean[::_SPARSE, ::_SPARSE, None] * rig.stereo.rays[::_SPARSE, ::_SPARSE]
-    up = (view.arm_before.T_base_flange @ rig.T_flange_tof)[2, :3]
-    crop = find_crop(
-        transform_points(rig.T_tof_stereo, sparse), up, np.random.default_rng(view.index), RADIUS, FAR
-    )
-    cropped = crop_depth(crop, np.asarray(depth), rig.stereo, rig.T_tof_stereo)
-    there = np.isfinite(cropped)
-    if not (there & keep).any():
+    check_cameras(view, rig)
+    depth = decode_burst(view.tof, calibrated(view.tof.info, rig)).depth
+    tof = rig.tof.unproject(np.where(depth < _CONFIG.far, depth, np.nan))
+    measured = np.ascontiguousarray(view.stereo.points[..., 2])
+    clean = denoise(measured, rig.stereo)
+    native = np.where(clean, measured, np.float32(np.nan))
+    T_base_tof = view.arm_before.T_base_flange @ rig.T_flange_tof
+    crop = find_object(native, rig, T_base_tof, _CONFIG, np.random.default_rng(view.index))
+    there = np.isfinite(crop_depth(crop, measured, rig.stereo, rig.T_tof_stereo))
+    if not (there & clean).any():
         raise DataError(
             f"{view.scene} {view.index}: no stereo point is left of the object", hint="check the rig"
         )
-    points = rig.stereo.unproject(cropped)
-    everything = rig.stereo.unproject(depth)
+    points = rig.stereo.unproject(measured)
+    captured, aligned = (_moved(points, T) for T in (view.rig.T_tof_stereo, rig.T_tof_stereo))
     return Steps(
         tof.reshape(-1, 3),
-        captured := _placed(everything, view.rig.T_tof_stereo),
-        aligned := _placed(everything, rig.T_tof_stereo),
-        _placed(points, rig.T_tof_stereo),
-        _placed(points[there & keep][None], rig.T_tof_stereo),
-        _placed(points[there & ~keep][None], rig.T_tof_stereo),
+        captured,
+        aligned,
+        _moved(points[there & clean], rig.T_tof_stereo),
+        _moved(points[there & ~clean], rig.T_tof_stereo),
         gap(captured, tof[..., 2], rig),
         gap(aligned, tof[..., 2], rig),
     )
 
 
-def _decoded(view: View, rig: Rig) -> Float64:
-    """(H, W, 3) points of the burst with the rig's constants."""
-    info = view.tof.info
-    errors = rig.range_errors or info.range_errors
-    info = replace(info, camera=rig.tof, illuminator=rig.illuminator, range_errors=errors)
-    depth = Decoder(info).burst(view.tof.raw, float(np.mean(view.tof.celsius))).depth
-    return rig.tof.unproject(np.where(depth < FAR, depth, np.nan))
-
-
-def _placed(points: NDArray[Any], T_tof_stereo: Float64) -> Float64:
+def _moved(points: NDArray[Any], T_tof_stereo: Float64) -> Float64:
     found = transform_points(T_tof_stereo, points).reshape(-1, 3)
-    return found[(found[:, 2] > 0) & (found[:, 2] < FAR)]
+    return found[(found[:, 2] > 0) & (found[:, 2] < _CONFIG.far)]
 
 
 def gap(stereo: Float64, depth: NDArray[np.floating], rig: Rig) -> float:
@@ -190,31 +161,21 @@ def gap(stereo: Float64, depth: NDArray[np.floating], rig: Rig) -> float:
 
 
 def _columns(steps: Steps, T_base_tof: Float64) -> list[Column]:
-    centre = np.median(steps.denoised, axis=0)
-    reach = _AROUND * np.percentile(np.linalg.norm(steps.denoised - centre, axis=1), 95)
+    centre = np.median(steps.kept, axis=0)
+    reach = _AROUND * np.percentile(np.linalg.norm(steps.kept - centre, axis=1), 95)
     about = steps.aligned[np.linalg.norm(steps.aligned - centre, axis=1) < reach]
-    whole, near = (stage_for(p, T_base_tof, _ASPECT) for p in (about, steps.denoised))
-    both = "orange: ToF; blue: stereo"
+    whole, near = (eye_for(p, T_base_tof, 1.0) for p in (about, steps.kept))
+    tof, kept, removed = (steps.tof, SENSOR), (steps.kept, GROUND_TRUTH), (steps.removed, REMOVED)
+    noise = f"{len(steps.removed)} of {len(steps.kept) + len(steps.removed)} points"
 
-    def cell(stage: Any, note: str, *clouds: Any) -> list[Cell]:
-        return [Cell(splat(clouds, stage, _WIDTH, 4), note=note)]
+    def column(title: str, note: str, eye: Eye, clouds: Any, *key: Any) -> Column:
+        return Column(title, [Cell(splat(clouds, eye, 480, 4), note=note)], key)
 
-    tof = (steps.tof, SENSOR)
-    kept, gone = (steps.denoised, GROUND_TRUTH), (steps.removed, REMOVED)
-    shares = f"{len(steps.removed)} of {len(steps.cropped)} points"
+    gaps = [f"median gap {1e3 * metres:.1f} mm" for metres in (steps.before, steps.after)]
+    captured, aligned = ([tof, (cloud, GROUND_TRUTH)] for cloud in (steps.captured, steps.aligned))
     return [
-        Column(
-            "captured, as mounted",
-            cell(whole, f"median gap {1e3 * steps.before:.1f} mm", tof, (steps.captured, GROUND_TRUTH)),
-            both,
-        ),
-        Column(
-            "aligned",
-            cell(whole, f"median gap {1e3 * steps.after:.1f} mm", tof, (steps.aligned, GROUND_TRUTH)),
-            both,
-        ),
-        Column(
-            "cropped", cell(near, f"red: {shares}", kept, gone), "blue: stereo;\nred: noise to be removed"
-        ),
-        Column("denoised", cell(near, f"{len(steps.denoised)} points", kept), "blue: ground truth"),
+        column("captured, as mounted", gaps[0], whole, captured, _TOF, _STEREO),
+        column("aligned", gaps[1], whole, aligned, _TOF, _STEREO),
+        column("cropped", f"red: {noise}", near, [kept, removed], _STEREO, _NOISE),
+        column("denoised", f"{len(steps.kept)} points", near, [kept], (GROUND_TRUTH, "ground truth")),
     ]

@@ -1,4 +1,4 @@
-"""Clouds as pictures: points are splatted from far to near and darkened where they lie behind their neighbours.
+"""Draw clouds as pictures: points are splatted from far to near and darkened where they lie behind their neighbours.
 
 Pictures of a fixed size keep PDF and SVG small, whatever the number of points.
 """
@@ -12,19 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.colours import UInt8
 from tofcapture.poses import Float64, transform_points
 
-UInt8 = NDArray[np.uint8]
-AZIMUTH, ELEVATION = (
-    np.radians(40.0),
-    np.radians(20.0),
+_AZIMUTH, _ELEVATION = np.radians(
+    (40.0, 20.0)
 )  # from where clouds are seen: beside the camera, above the table
 _SHADE = 60.0  # how dark a step of depth makes a point, per unit of the picture's extent
 _MARGIN = 0.06  # of the extent
 
 
 @dataclass(frozen=True)
-class Stage:
+class Eye:
     """From where clouds are seen, orthographically.
 
     Attributes
@@ -46,7 +45,7 @@ class Stage:
         return float(width / height)
 
 
-def stage_for(points: Float64, T_base_tof: Float64, aspect: float = 4 / 3) -> Stage:
+def eye_for(points: Float64, T_base_tof: Float64, aspect: float = 4 / 3) -> Eye:
     """Look at a cloud from the camera's left and from above, the table level.
 
     Parameters
@@ -58,81 +57,67 @@ def stage_for(points: Float64, T_base_tof: Float64, aspect: float = 4 / 3) -> St
     aspect
         Width over height of the picture.
     """
+    axis = T_base_tof[:3, 2]
+    heading = np.arctan2(axis[1], axis[0]) + _AZIMUTH
+    flat = np.cos(_ELEVATION)
+    away = np.array([np.cos(heading) * flat, np.sin(heading) * flat, -np.sin(_ELEVATION)])
+    right = np.array([np.sin(heading), -np.cos(heading), 0.0])
     T = np.eye(4)
-    T[:3, :3] = _looking(T_base_tof[:3, 2]) @ T_base_tof[:3, :3]
+    T[:3, :3] = np.stack([right, np.cross(away, right), away]) @ T_base_tof[:3, :3]
     seen = transform_points(T, points)[:, :2] if len(points) else np.zeros((1, 2))
     low, high = np.percentile(seen, (0.5, 99.5), axis=0)
     extent = np.maximum((high - low) * (1 + 2 * _MARGIN), 0.01)
     extent = np.array([max(extent[0], aspect * extent[1]), max(extent[1], extent[0] / aspect)])
     middle = (low + high) / 2
-    return Stage(T, middle - extent / 2, middle + extent / 2)
-
-
-def _looking(axis: Float64) -> Float64:
-    """Rotation (3, 3) from the base to an eye whose heading is the camera's, turned by the azimuth."""
-    heading = np.arctan2(axis[1], axis[0]) + AZIMUTH
-    away = np.array(
-        [
-            np.cos(heading) * np.cos(ELEVATION),
-            np.sin(heading) * np.cos(ELEVATION),
-            -np.sin(ELEVATION),
-        ]
-    )
-    right = np.array([np.sin(heading), -np.cos(heading), 0.0])
-    return np.stack([right, np.cross(away, right), away])
+    return Eye(T, middle - extent / 2, middle + extent / 2)
 
 
 def splat(
-    clouds: Sequence[tuple[NDArray[Any], tuple[int, int, int]]], stage: Stage, width: int = 480, size: int = 2
+    clouds: Sequence[tuple[NDArray[Any], Any]],
+    eye: Eye,
+    width: int = 480,
+    size: int = 2,
+    ground: int = 255,
 ) -> UInt8:
-    """Draw clouds on white.
+    """Draw clouds on a plain ground.
 
     Parameters
     ----------
     clouds
-        Points (N, 3) in the ToF frame, metres, NaN allowed, and the colour of each cloud.
-    stage
+        Points (..., 3) in the ToF frame, metres, NaN allowed, and of each cloud its colour (3,) or colours (..., 3).
+    eye
         From where.
     width
         Of the picture, pixels.
     size
         Edge of a point, pixels.
+    ground
+        Grey of what no point covers.
 
     Returns
     -------
     (H, W, 3) uint8.
     """
-    height = round(width / stage.aspect)
-    index, depth, colours = _gathered(clouds, stage, width, height, size)
-    order = np.argsort(-depth, kind="stable")  # the nearest is written last
-    nearest = np.full(width * height, np.inf)
-    nearest[index[order]] = depth[order]
-    image = np.full((width * height, 3), 255.0)
-    image[index[order]] = colours[order]
-    scale = 1 / float(np.max(stage.high - stage.low))
-    shade = _shade(nearest.reshape(height, width) * scale)
-    return np.rint(image.reshape(height, width, 3) * shade[..., None]).astype(np.uint8)
-
-
-def _gathered(
-    clouds: Sequence[tuple[NDArray[Any], tuple[int, int, int]]],
-    stage: Stage,
-    width: int,
-    height: int,
-    size: int,
-) -> tuple[NDArray[np.intp], Float64, Float64]:
-    """Pixels (M,), depths (M,) and colours (M, 3) of everything that is in the picture."""
+    height = round(width / eye.aspect)
     found: list[tuple[Any, Any, Any]] = [(np.zeros(0, np.intp), np.zeros(0), np.zeros((0, 3)))]
     for points, colour in clouds:
         flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        eye = transform_points(stage.T_eye_tof, flat[np.isfinite(flat).all(axis=1)])
-        at = np.floor((eye[:, :2] - stage.low) / (stage.high - stage.low) * [width, height]).astype(np.intp)
+        known = np.isfinite(flat).all(axis=1)
+        painted = np.broadcast_to(np.reshape(colour, (-1, 3)), flat.shape)[known]
+        seen = transform_points(eye.T_eye_tof, flat[known])
+        at = np.floor((seen[:, :2] - eye.low) / (eye.high - eye.low) * [width, height]).astype(np.intp)
         for dy, dx in np.ndindex(size, size):
             x, y = at[:, 0] + dx, at[:, 1] + dy
             keep = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            found.append(((y * width + x)[keep], eye[keep, 2], np.broadcast_to(colour, (keep.sum(), 3))))
+            found.append(((y * width + x)[keep], seen[keep, 2], painted[keep]))
     index, depth, colours = (np.concatenate(part) for part in zip(*found, strict=True))
-    return index, depth, colours
+    order = np.argsort(-depth, kind="stable")  # the nearest is written last
+    nearest = np.full(width * height, np.inf)
+    nearest[index[order]] = depth[order]
+    image = np.full((width * height, 3), float(ground))
+    image[index[order]] = colours[order]
+    shade = _shade(nearest.reshape(height, width) / float(np.max(eye.high - eye.low)))
+    return np.rint(image.reshape(height, width, 3) * shade[..., None]).astype(np.uint8)
 
 
 def _shade(depth: Float64) -> Float64:

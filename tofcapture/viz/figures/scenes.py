@@ -1,0 +1,302 @@
+"""Draw rows of scenes: depth with its errors and clouds, or normals with their angular errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.camera import Camera
+from tofcapture.colours import ESTIMATE, GROUND_TRUTH, SENSOR, Kind, Scale, paint_normals, scale_for
+from tofcapture.errors import DataError, UsageError
+from tofcapture.files.manifest import load_manifest
+from tofcapture.files.maps import GroundTruth
+from tofcapture.files.shard import ShardReader
+from tofcapture.poses import Float64
+from tofcapture.viz.clouds import eye_for, splat
+from tofcapture.viz.sharded import read_maps
+from tofcapture.viz.table import Cell, Column, draw_table
+
+Float32 = NDArray[np.float32]
+_ROOM = 1.25  # of the window about the object, relative to the object
+_LEAST = 0.2  # of the image's sides that a window shows at least
+_NORMAL_KEY = ((None, "red right, green up,"), (None, "blue towards the camera"))
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Depth (H, W) in metres and normals (H, W, 3) of one method, at the scale of the ground truth beside them."""
+
+    depth: Float32
+    normals: Float32
+    truth: GroundTruth
+
+    @property
+    def good(self) -> NDArray[np.bool_]:
+        """(H, W) where ground truth is good: the object."""
+        out: NDArray[np.bool_] = self.truth.mask == 0
+        return out
+
+    @property
+    def error_mm(self) -> Float64:
+        """(H, W) depth minus ground truth where that is good, millimetres."""
+        return np.where(self.good, self.error_everywhere_mm, np.nan)
+
+    @property
+    def error_everywhere_mm(self) -> Float64:
+        """(H, W) depth minus ground truth, millimetres."""
+        return 1e3 * (self.depth.astype(np.float64) - self.truth.depth)
+
+    @property
+    def angle_deg(self) -> Float64:
+        """(H, W) angle to the normal of ground truth where that is good, degrees."""
+        a, b = self.normals.astype(np.float64), self.truth.normals.astype(np.float64)
+        # atan2, since arccos knows no small angles.
+        angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
+        return np.where(self.good, np.degrees(angle), np.nan)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scene.
+
+    Attributes
+    ----------
+    name
+        Scene and number of the view.
+    camera
+        ToF camera; maps may have twice its resolution.
+    T_base_tof
+        (4, 4).
+    amplitude
+        (H, W) raw units.
+    sensor
+        At the camera's resolution.
+    prediction
+        At twice the camera's; ``None``: not given.
+    truth
+        At twice the camera's.
+    """
+
+    name: str
+    camera: Camera
+    T_base_tof: Float64
+    amplitude: Float32
+    sensor: Maps
+    prediction: Maps | None
+    truth: GroundTruth
+
+    @property
+    def methods(self) -> dict[str, Maps]:
+        """Sensor, and the prediction where there is one."""
+        return {"sensor": self.sensor} | ({} if self.prediction is None else {"prediction": self.prediction})
+
+    def shown(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Cut an image at either resolution to the window about the object."""
+        window = object_window(self.truth.mask == 0)
+        return image[window if len(image) > self.camera.height else halved(window)]
+
+
+def object_window(on_object: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Rows and columns about an object (2H, 2W), in the image's proportions, starts and ends even; all without any."""
+    rows, columns = np.nonzero(on_object)
+    height, width = on_object.shape
+    if len(rows) == 0:
+        return slice(0, height), slice(0, width)
+    share = _ROOM * max((np.ptp(rows) + 1) / height, (np.ptp(columns) + 1) / width)
+
+    def span(at: NDArray[np.intp], size: int) -> slice:
+        length = 2 * round(min(max(share, _LEAST), 1.0) * size / 2)
+        start = min(max((int(at.min()) + int(at.max())) // 2 - length // 2, 0), size - length) // 2 * 2
+        return slice(start, start + length)
+
+    return span(rows, height), span(columns, width)
+
+
+def halved(window: tuple[slice, slice]) -> tuple[slice, slice]:
+    """Return the same window on the sensor's own grid."""
+    rows, columns = (slice(s.start // 2, (s.stop + 1) // 2) for s in window)
+    return rows, columns
+
+
+def read_rows(path: Path, scene: str | None, view: int, most: int, prediction: Path | None) -> list[Row]:
+    """Read one view of each scene.
+
+    Parameters
+    ----------
+    path
+        Dataset or shard.
+    scene
+        Only this one; ``None``: as many as there may be, spread evenly.
+    view
+        Number in the shard.
+    most
+        Largest number of rows.
+    prediction
+        Folder of ``predict``, or of such folders by name; ``None``: none.
+
+    Raises
+    ------
+    DataError
+        There is no such scene, view or prediction, or it is of another size.
+    UsageError
+        One prediction for several scenes.
+    """
+    paths = _shards(path, scene, most)
+    if prediction is not None and (prediction / "depth.npy").exists() and len(paths) > 1:
+        raise UsageError(
+            f"--prediction {prediction}: one prediction, but {len(paths)} scenes",
+            hint="say which with --scene, or give a folder with one prediction a scene",
+        )
+    return [_row(p, view, prediction) for p in paths]
+
+
+def _shards(path: Path, scene: str | None, most: int) -> list[Path]:
+    if not path.exists():
+        raise DataError(f"{path}: no such file or folder", hint="give a dataset or a shard")
+    if path.is_file():
+        with ShardReader(path) as shard:
+            found = {shard.scene: path}
+    elif (path / "manifest.json").exists():
+        found = {name: path / entry.path for name, entry in sorted(load_manifest(path).scenes.items())}
+    else:
+        raise DataError(
+            f"{path}: expected a dataset or a shard", hint="tofcapture build-dataset RECORDING --out DATASET"
+        )
+    if scene is not None and scene not in found:
+        raise DataError(f"{path}: no scene {scene}", hint=f"it has {', '.join(found) or 'none'}")
+    names = list(found) if scene is None else [scene]
+    if not names:
+        raise DataError(f"{path}: expected at least one scene, found none")
+    some = sorted({round(i) for i in np.linspace(0, len(names) - 1, min(most, len(names)))})
+    return [found[names[i]] for i in some]
+
+
+def _row(path: Path, view: int, prediction: Path | None) -> Row:
+    with ShardReader(path) as shard:
+        if not 0 <= view < shard.views:
+            raise DataError(f"{path}: expected a view of 0 to {shard.views - 1}, got {view}", hint="--view 0")
+        tof, truth, fine = shard.tof(view), shard.ground_truth(view, 1), shard.ground_truth(view, 2)
+        given = None if prediction is None else _predicted(prediction, shard.scene, view, fine)
+        sensor = Maps(tof.depth, shard.tof_normals(view), truth)
+        name = f"{shard.scene} {shard.index(view)}"
+        return Row(name, shard.camera, shard.T_base_tof(view), tof.confidence, sensor, given, fine)
+
+
+def _predicted(folder: Path, scene: str, view: int, truth: GroundTruth) -> Maps:
+    places = [folder, folder / f"{scene}-{view:03d}", folder / scene]
+    found = next((p for p in places if (p / "depth.npy").exists()), None)
+    if found is None:
+        raise DataError(
+            f"{folder}: no prediction of {scene} {view}: no depth.npy in {places[1].name}/ or {scene}/",
+            hint=f"tofcapture predict SHARD --view {view} --out {places[1]}",
+        )
+    depth, normals = read_maps(found)
+    if depth.shape != truth.depth.shape or normals.shape != truth.normals.shape:
+        raise DataError(
+            f"{found}: expected depth of {truth.depth.shape} and normals of {truth.normals.shape}, "
+            f"got {depth.shape} and {normals.shape}",
+            hint="is it the prediction of another camera?",
+        )
+    return Maps(depth, normals, truth)
+
+
+def draw_rows(figure: Any, kind: str, rows: Sequence[Row]) -> str:
+    """Draw rows of ``depth`` or ``normals``; returns what is on it, in words.
+
+    Parameters
+    ----------
+    figure
+        Of matplotlib.
+    kind
+        Which.
+    rows
+        All with a prediction or all without.
+    """
+    amplitude = _scaled("amplitude", rows, [row.amplitude for row in rows], "amplitude")
+    columns, error = (_depth_columns if kind == "depth" else _normal_columns)(rows)
+    title = f"{'Depth' if kind == 'depth' else 'Normals'} against ground truth"
+    aspect = rows[0].camera.width / rows[0].camera.height
+    draw_table(figure, title, [row.name for row in rows], [amplitude, *columns], aspect)
+    sign = "±" if kind == "depth" else "0 to "
+    return (
+        f"{len(rows)} scene{'s' if len(rows) > 1 else ''}, scale of errors {sign}{error.high:g} {error.unit}"
+    )
+
+
+def _depth_columns(rows: Sequence[Row]) -> tuple[list[Column], Scale]:
+    named = [(name, row.methods[name]) for name in rows[0].methods for row in rows]
+    depths = [(maps.depth, maps.good) for _, maps in named] + [
+        (r.truth.depth, r.truth.mask == 0) for r in rows
+    ]
+    depth = scale_for("depth", [d for d, _ in depths], [g for _, g in depths])
+    error = scale_for("error", [maps.error_mm for _, maps in named])
+    columns = [
+        _scaled(f"{name} depth", rows, [row.methods[name].depth for row in rows], depth)
+        for name in rows[0].methods
+    ]
+    columns.append(_scaled("ground truth", rows, [row.truth.depth for row in rows], depth))
+    for name in rows[0].methods:
+        errors = [row.methods[name].error_mm for row in rows]
+        notes = [_note("mean |e| {:.2f} mm", np.abs(e)) for e in errors]
+        columns.append(_scaled(f"{name} error", rows, errors, error, notes))
+    best, (name, colour) = "from the side", _best(rows)
+    key = ((colour, name), (GROUND_TRUTH, "ground truth"))
+    return [*columns, Column(best, [Cell(_cloud(row)) for row in rows], key)], error
+
+
+def _normal_columns(rows: Sequence[Row]) -> tuple[list[Column], Scale]:
+    angle = scale_for("angle", [maps.angle_deg for row in rows for maps in row.methods.values()])
+    columns = [
+        _painted(f"{name} normals", rows, [row.methods[name].normals for row in rows], _NORMAL_KEY)
+        for name in rows[0].methods
+    ]
+    columns.append(_painted("ground truth", rows, [row.truth.normals for row in rows]))
+    for name in rows[0].methods:
+        angles = [row.methods[name].angle_deg for row in rows]
+        notes = [_note("mean {:.1f}\N{DEGREE SIGN}", a) for a in angles]
+        columns.append(_scaled(f"{name} error", rows, angles, angle, notes))
+    return columns, angle
+
+
+def _note(form: str, values: Float64) -> str:
+    return form.format(np.nanmean(values)) if np.isfinite(values).any() else ""
+
+
+def _scaled(
+    title: str,
+    rows: Sequence[Row],
+    maps: Sequence[NDArray[Any]],
+    scale: Scale | Kind,
+    notes: Sequence[str] = (),
+) -> Column:
+    if not isinstance(scale, Scale):
+        scale = scale_for(scale, maps)
+    cells = [
+        Cell(scale.paint(row.shown(values)), scale, note)
+        for row, values, note in zip(rows, maps, notes or [""] * len(rows), strict=True)
+    ]
+    return Column(title, cells)
+
+
+def _painted(title: str, rows: Sequence[Row], normals: Sequence[Float32], key: Any = ()) -> Column:
+    cells = [Cell(paint_normals(row.shown(n))) for row, n in zip(rows, normals, strict=True)]
+    return Column(title, cells, key)
+
+
+def _best(rows: Sequence[Row]) -> tuple[str, tuple[int, int, int]]:
+    return ("sensor", SENSOR) if rows[0].prediction is None else ("prediction", ESTIMATE)
+
+
+def _cloud(row: Row) -> NDArray[np.uint8]:
+    """Draw the object alone, of the best that is known of it, over its ground truth."""
+    name, colour = _best([row])
+    maps, fine = row.methods[name], row.camera.scaled(2)
+    exact = fine.unproject(row.truth.depth)[row.truth.mask == 0]
+    found = (row.camera if row.prediction is None else fine).unproject(maps.depth)[maps.good]
+    aspect = row.camera.width / row.camera.height
+    return splat([(exact, GROUND_TRUTH), (found, colour)], eye_for(exact, row.T_base_tof, aspect), 400, 3)
