@@ -86,9 +86,10 @@ def mask_picture(
 def mask_legend(mask: NDArray[np.uint8]) -> list[tuple[str, str, str]]:
     """(CSS colour, words, share of the pixels) of every colour of a mask."""
     shares = np.bincount(mask_classes(mask).ravel(), minlength=1 + len(MASK)) / max(mask.size, 1)
+    named = [(0, *GOOD), *((int(bit), *meaning) for bit, meaning in MASK.items())]
     return [
-        (f"rgb{colour}", f"{int(bit)}: {words}", f"{100 * share:.1f}\N{NO-BREAK SPACE}%")
-        for (bit, (colour, words)), share in zip({0: GOOD, **MASK}.items(), shares, strict=True)
+        (f"rgb{colour}", f"{bit}: {words}", f"{100 * share:.1f}\N{NO-BREAK SPACE}%")
+        for (bit, colour, words), share in zip(named, shares, strict=True)
     ]
 
 

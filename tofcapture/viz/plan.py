@@ -81,7 +81,7 @@ def _bounds(plan: Plan, stage: Stage, rig: Rig, target: Float64) -> tuple[Float6
 def _draw_above(axes: Any, stage: Stage) -> None:
     from matplotlib.patches import Circle
 
-    axes.add_patch(Circle(stage.target[:2], stage.keep_out_radius, fc=_PINK, ec=_RED))
+    axes.add_patch(Circle((stage.target[0], stage.target[1]), stage.keep_out_radius, fc=_PINK, ec=_RED))
     axes.add_patch(Circle((0, 0), _COLUMN, fc="#e8eaed", ec=_GREY))
     axes.text(0, 0, "base", ha="center", va="center")
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from tofcapture.colours import GOOD, MASK
+from tofcapture.colours import GOOD, MASK, Scale
 from tofcapture.viz.charts import canvas, draw_bars, draw_rig, save
 from tofcapture.viz.shots import Panel, Shot, Source, scales_of
-from tofcapture.viz.table import FONT, SMALL, WIDTH, Cell, Column, draw_table
+from tofcapture.viz.table import DEPTH_KEY, FONT, NORMAL_KEY, SMALL, WIDTH, Cell, Column, draw_table
 
-_NORMALS = ((None, "red right, green up,"), (None, "blue towards the camera"))
 _MASK = [(GOOD[0], "good"), *((c, str(bit.name).lower().replace("_", " ")) for bit, (c, _) in MASK.items())]
+_KEYS: Mapping[str, Any] = {"normals": NORMAL_KEY, "mask": _MASK, "depth": DEPTH_KEY}
 
 
 def write_sheet(source: Source, path: Path, most: int, progress: Callable[[int, int], None]) -> int:
@@ -50,19 +50,22 @@ def write_sheet(source: Source, path: Path, most: int, progress: Callable[[int, 
 def _shots(figure: Any, source: Source, shots: list[Shot]) -> None:
     total = len(source.names)
     views = f"{total} views" if len(shots) == total else f"{len(shots)} of {total} views"
-    scales = scales_of([panel for shot in shots for panel in shot.panels])
-    columns = [
-        _column([shot.panels[c] if c < len(shot.panels) else None for shot in shots], scales)
-        for c in range(max(len(shot.panels) for shot in shots))
-    ]
+    shared = scales_of([panel for shot in shots for panel in shot.panels])
+    columns = []
+    for c in range(max(len(shot.panels) for shot in shots)):
+        panels = [shot.panels[c] for shot in shots if c < len(shot.panels)]
+        cells = [_cell(shot, shot.panels[c], shared) if c < len(shot.panels) else None for shot in shots]
+        columns.append(Column(panels[0].title, cells, _KEYS.get(panels[0].kind, ())))
     height, width = shots[0].panels[0].values.shape[:2]
     draw_table(figure, f"{source.title}: {views}", [s.name for s in shots], columns, width / height)
 
 
-def _column(panels: list[Panel | None], scales: dict[str, Any]) -> Column:
-    cells = [Cell(p.paint(scales.get(p.kind)), scales.get(p.kind)) if p else None for p in panels]
-    title, kind = next((p.title, p.kind) for p in panels if p)
-    return Column(title, cells, {"normals": _NORMALS, "mask": _MASK}.get(kind, ()))
+def _cell(shot: Shot, panel: Panel, shared: Mapping[str, Scale]) -> Cell:
+    """Paint a panel: depth on a scale of the shot's own that shows its object, all else on those of the sheet."""
+    if panel.kind != "depth":
+        return Cell(panel.paint(shared.get(panel.kind)), shared.get(panel.kind))
+    scale = scales_of(shot.panels)["depth"]
+    return Cell(panel.paint(scale), scale, f"{scale.low:.2f} to {scale.high:.2f} m")
 
 
 def _calibration(figure: Any, source: Source) -> None:

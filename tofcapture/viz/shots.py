@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,9 +122,10 @@ class Source:
 
 def scales_of(panels: Sequence[Panel]) -> dict[str, Scale]:
     """Scale of every kind that has one; panels of one kind share it, so that they can be compared."""
-    scales = {}
-    for kind in {p.kind for p in panels} - {"normals", "mask"}:
+    scales: dict[str, Scale] = {}
+    for kind in get_args(ScaleKind):
         alike = sorted((p for p in panels if p.kind == kind), key=lambda p: p.on_object is None)
-        objects = [p.on_object for p in alike if p.on_object is not None]
-        scales[kind] = scale_for(kind, [p.values for p in alike], objects)
+        if alike:
+            objects = [p.on_object for p in alike if p.on_object is not None]
+            scales[kind] = scale_for(kind, [p.values for p in alike], objects)
     return scales

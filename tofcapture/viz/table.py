@@ -10,6 +10,8 @@ import numpy as np
 
 from tofcapture.colours import Scale, UInt8, palette
 
+NORMAL_KEY = ((None, "red right, green up,"), (None, "blue towards the camera"))
+DEPTH_KEY = ((None, "dark near, bright far: see"), (None, "each picture; grey: none"))
 WIDTH = 12.0  # inches: 1200 pixels
 SMALL, FONT = 9.0, 11.0  # points at 100 dots an inch: 12 and 15 pixels
 _HEAD, _FOOT, _GAP = 0.5, 0.72, 0.05  # inches
@@ -35,8 +37,9 @@ class Column:
 
     @property
     def scale(self) -> Scale | None:
-        """Scale of its cells."""
-        return next((cell.scale for cell in self.cells if cell), None)
+        """Scale that all its cells share."""
+        scales = {cell.scale for cell in self.cells if cell}
+        return scales.pop() if len(scales) == 1 else None
 
 
 def draw_table(
@@ -75,7 +78,8 @@ def draw_table(
                 axes.set_title(column.title, fontsize=SMALL, pad=3)
             if c == 0:
                 axes.set_ylabel(names[r], fontsize=SMALL)
-        _draw_key(figure, column, x, width, height)
+        if column.scale is None:
+            _draw_key(figure, column, x, width, height)
     _draw_bars(figure, columns, width, height)
 
 

@@ -64,7 +64,7 @@ def draw_acquisition(figure: Any, path: Path, scene: str | None, view: int | Non
     poses = [_pose_of(p, arm) for p in paths]
     _draw_space(figure, poses, paths.index(chosen), rig, shots[0])
     axes = figure.add_axes((0.07, 0.1, 0.26, 0.175))
-    draw_rig(axes, rig, 0, 2)
+    draw_rig(axes, rig, int(np.argmax(np.abs(rig.T_tof_stereo[:2, 3]))), 2)
     baseline = 1e3 * float(np.linalg.norm(rig.T_tof_stereo[:3, 3]))
     axes.set_title(f"rig: {baseline:.0f} mm between the cameras", fontsize=SMALL, pad=3)
     _draw_panels(figure, shots)

@@ -19,7 +19,7 @@ from tofcapture.ops.denoise import denoise
 from tofcapture.poses import Float64, transform_points
 from tofcapture.rig import Rig, load_rig
 from tofcapture.viz.captured import pick_view
-from tofcapture.viz.clouds import Eye, eye_for, splat
+from tofcapture.viz.figures.clouds import Eye, eye_for, splat
 from tofcapture.viz.table import Cell, Column, draw_table
 
 _CONFIG = SampleConfig()

@@ -11,20 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.colours import ESTIMATE, GROUND_TRUTH, SENSOR, Kind, Scale, paint_normals, scale_for
+from tofcapture.colours import ESTIMATE, GROUND_TRUTH, SENSOR, Scale, paint_normals, scale_for
 from tofcapture.errors import DataError, UsageError
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.maps import GroundTruth
 from tofcapture.files.shard import ShardReader
 from tofcapture.poses import Float64
-from tofcapture.viz.clouds import eye_for, splat
+from tofcapture.viz.figures.clouds import eye_for, splat
 from tofcapture.viz.sharded import read_maps
-from tofcapture.viz.table import Cell, Column, draw_table
+from tofcapture.viz.table import DEPTH_KEY, NORMAL_KEY, Cell, Column, draw_table
 
 Float32 = NDArray[np.float32]
-_ROOM = 1.25  # of the window about the object, relative to the object
+_ROOM = 1.3  # of the window about the object, relative to the object
 _LEAST = 0.2  # of the image's sides that a window shows at least
-_NORMAL_KEY = ((None, "red right, green up,"), (None, "blue towards the camera"))
 
 
 @dataclass(frozen=True)
@@ -107,14 +106,15 @@ def object_window(on_object: NDArray[np.bool_]) -> tuple[slice, slice]:
     height, width = on_object.shape
     if len(rows) == 0:
         return slice(0, height), slice(0, width)
-    share = _ROOM * max((np.ptp(rows) + 1) / height, (np.ptp(columns) + 1) / width)
+    ends = [np.percentile(at, (1, 99)) for at in (rows, columns)]
+    share = _ROOM * max(float(np.ptp(e)) / size for e, size in zip(ends, (height, width), strict=True))
 
-    def span(at: NDArray[np.intp], size: int) -> slice:
+    def span(middle: float, size: int) -> slice:
         length = 2 * round(min(max(share, _LEAST), 1.0) * size / 2)
-        start = min(max((int(at.min()) + int(at.max())) // 2 - length // 2, 0), size - length) // 2 * 2
+        start = min(max(round(middle) - length // 2, 0), size - length) // 2 * 2
         return slice(start, start + length)
 
-    return span(rows, height), span(columns, width)
+    return span(float(ends[0].mean()), height), span(float(ends[1].mean()), width)
 
 
 def halved(window: tuple[slice, slice]) -> tuple[slice, slice]:
@@ -217,7 +217,8 @@ def draw_rows(figure: Any, kind: str, rows: Sequence[Row]) -> str:
     rows
         All with a prediction or all without.
     """
-    amplitude = _scaled("amplitude", rows, [row.amplitude for row in rows], "amplitude")
+    images, bare = [row.amplitude for row in rows], [""] * len(rows)
+    amplitude = _scaled("amplitude", rows, images, [scale_for("amplitude", images)] * len(rows), bare)
     columns, error = (_depth_columns if kind == "depth" else _normal_columns)(rows)
     title = f"{'Depth' if kind == 'depth' else 'Normals'} against ground truth"
     aspect = rows[0].camera.width / rows[0].camera.height
@@ -229,37 +230,40 @@ def draw_rows(figure: Any, kind: str, rows: Sequence[Row]) -> str:
 
 
 def _depth_columns(rows: Sequence[Row]) -> tuple[list[Column], Scale]:
-    named = [(name, row.methods[name]) for name in rows[0].methods for row in rows]
-    depths = [(maps.depth, maps.good) for _, maps in named] + [
-        (r.truth.depth, r.truth.mask == 0) for r in rows
-    ]
-    depth = scale_for("depth", [d for d, _ in depths], [g for _, g in depths])
-    error = scale_for("error", [maps.error_mm for _, maps in named])
+    depths = [_depth_scale(row) for row in rows]
+    notes = [scale.words for scale in depths]
+    error = scale_for("error", [maps.error_mm for row in rows for maps in row.methods.values()])
     columns = [
-        _scaled(f"{name} depth", rows, [row.methods[name].depth for row in rows], depth)
+        _scaled(f"{name} depth", rows, [row.methods[name].depth for row in rows], depths, notes, DEPTH_KEY)
         for name in rows[0].methods
     ]
-    columns.append(_scaled("ground truth", rows, [row.truth.depth for row in rows], depth))
+    columns.append(_scaled("ground truth", rows, [row.truth.depth for row in rows], depths, notes))
     for name in rows[0].methods:
         errors = [row.methods[name].error_mm for row in rows]
         notes = [_note("mean |e| {:.2f} mm", np.abs(e)) for e in errors]
-        columns.append(_scaled(f"{name} error", rows, errors, error, notes))
-    best, (name, colour) = "from the side", _best(rows)
+        columns.append(_scaled(f"{name} error", rows, errors, [error] * len(rows), notes))
+    name, colour = _best(rows[0])
     key = ((colour, name), (GROUND_TRUTH, "ground truth"))
-    return [*columns, Column(best, [Cell(_cloud(row)) for row in rows], key)], error
+    return [*columns, Column("from the side", [Cell(_cloud(row)) for row in rows], key)], error
+
+
+def _depth_scale(row: Row) -> Scale:
+    """Scale that shows the object of one row."""
+    maps = [(m.depth, m.good) for m in row.methods.values()] + [(row.truth.depth, row.truth.mask == 0)]
+    return scale_for("depth", [depth for depth, _ in maps], [good for _, good in maps])
 
 
 def _normal_columns(rows: Sequence[Row]) -> tuple[list[Column], Scale]:
     angle = scale_for("angle", [maps.angle_deg for row in rows for maps in row.methods.values()])
     columns = [
-        _painted(f"{name} normals", rows, [row.methods[name].normals for row in rows], _NORMAL_KEY)
+        _painted(f"{name} normals", rows, [row.methods[name].normals for row in rows], NORMAL_KEY)
         for name in rows[0].methods
     ]
     columns.append(_painted("ground truth", rows, [row.truth.normals for row in rows]))
     for name in rows[0].methods:
         angles = [row.methods[name].angle_deg for row in rows]
         notes = [_note("mean {:.1f}\N{DEGREE SIGN}", a) for a in angles]
-        columns.append(_scaled(f"{name} error", rows, angles, angle, notes))
+        columns.append(_scaled(f"{name} error", rows, angles, [angle] * len(rows), notes))
     return columns, angle
 
 
@@ -271,16 +275,15 @@ def _scaled(
     title: str,
     rows: Sequence[Row],
     maps: Sequence[NDArray[Any]],
-    scale: Scale | Kind,
-    notes: Sequence[str] = (),
+    scales: Sequence[Scale],
+    notes: Sequence[str],
+    key: Any = (),
 ) -> Column:
-    if not isinstance(scale, Scale):
-        scale = scale_for(scale, maps)
     cells = [
         Cell(scale.paint(row.shown(values)), scale, note)
-        for row, values, note in zip(rows, maps, notes or [""] * len(rows), strict=True)
+        for row, values, scale, note in zip(rows, maps, scales, notes, strict=True)
     ]
-    return Column(title, cells)
+    return Column(title, cells, key)
 
 
 def _painted(title: str, rows: Sequence[Row], normals: Sequence[Float32], key: Any = ()) -> Column:
@@ -288,13 +291,13 @@ def _painted(title: str, rows: Sequence[Row], normals: Sequence[Float32], key: A
     return Column(title, cells, key)
 
 
-def _best(rows: Sequence[Row]) -> tuple[str, tuple[int, int, int]]:
-    return ("sensor", SENSOR) if rows[0].prediction is None else ("prediction", ESTIMATE)
+def _best(row: Row) -> tuple[str, tuple[int, int, int]]:
+    return ("sensor", SENSOR) if row.prediction is None else ("prediction", ESTIMATE)
 
 
 def _cloud(row: Row) -> NDArray[np.uint8]:
     """Draw the object alone, of the best that is known of it, over its ground truth."""
-    name, colour = _best([row])
+    name, colour = _best(row)
     maps, fine = row.methods[name], row.camera.scaled(2)
     exact = fine.unproject(row.truth.depth)[row.truth.mask == 0]
     found = (row.camera if row.prediction is None else fine).unproject(maps.depth)[maps.good]
