@@ -29,11 +29,12 @@ from calibration.evidence.evidence import alignment_error
 from calibration.registration.backends import register_open3d
 from calibration.registration.clouds import WORKING_DEPTH, Cloud, tof_depth
 from tofcapture.devices.sim import stereo as stereos
+from tofcapture.devices.sim.config import Constants, read_constants
 from tofcapture.devices.sim.light import Light
 from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects
 from tofcapture.devices.sim.sensor import expose
 from tofcapture.devices.sim.stereo import point_map
-from tofcapture.devices.sim.world import Constants, SimWorld, read_constants
+from tofcapture.devices.sim.world import SimWorld
 from tofcapture.frames import ArmState, StereoFrame, TofBurst, Truth, View
 from tofcapture.poses import Float64, invert, look_at, rotation_exp, transform_points
 

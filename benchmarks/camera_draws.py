@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tofcapture.devices.sim.world import factory_calibration, read_constants
+from tofcapture.devices.sim.config import read_constants
+from tofcapture.devices.sim.world import factory_calibration
 from tofcapture.rig import RangeError
 from tofcapture_model.data.frames import FrameDataset, batched, frame_decoder, make_frame
 from tofcapture_model.networks.baselines import sensor

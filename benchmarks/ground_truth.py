@@ -22,13 +22,14 @@ import numpy as np
 
 from tofcapture.dataset.sample import SampleConfig, make_sample
 from tofcapture.dataset.truth import CropShares, class_errors, crop_shares
+from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.scene import SceneObject
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
-from tofcapture.devices.sim.shapes.made import board
-from tofcapture.devices.sim.shapes.mesh import Mesh, cuboid, move
+from tofcapture.devices.sim.shapes import board
 from tofcapture.devices.sim.stereo import ideal
-from tofcapture.devices.sim.world import SimWorld, read_constants
+from tofcapture.devices.sim.world import SimWorld
 from tofcapture.frames import ArmState, View
+from tofcapture.meshes import Mesh, cuboid, move
 from tofcapture.o3d import load_open3d
 from tofcapture.ops.denoise import denoise
 from tofcapture.poses import exp, invert, look_at, transform

@@ -22,7 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tofcapture.devices.sim.worldfile import load_world, simulate
+from tofcapture.devices.sim.config import load_world
+from tofcapture.devices.sim.world import simulate
 from tofcapture.ops.phase import mean_phasors, radial_to_range, wrapped_range
 from tofcapture.poses import transform_points
 

@@ -16,8 +16,9 @@ import numpy as np
 
 from calibration.range_error.fit import RangeFit, fit_ranges
 from calibration.range_error.views import Seen, seen_of
+from tofcapture.devices.sim.config import Constants, read_constants
 from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects
-from tofcapture.devices.sim.world import Constants, SimWorld, read_constants
+from tofcapture.devices.sim.world import SimWorld
 from tofcapture.errors import QualityError, TofError
 from tofcapture.frames import ArmState, View
 from tofcapture.ops.phase import radius_px

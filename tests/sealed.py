@@ -5,8 +5,9 @@ from __future__ import annotations
 import h5py
 import numpy as np
 
+from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
-from tofcapture.devices.sim.world import SimWorld, read_constants
+from tofcapture.devices.sim.world import SimWorld
 from tofcapture.files.seal import digest_path, sha256_of
 from tofcapture.frames import ArmState, View
 from tofcapture.poses import invert, look_at

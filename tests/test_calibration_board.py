@@ -19,10 +19,10 @@ from calibration.board.geometry import Board, board_from, distance_to_ring, insi
 from calibration.board.model import Model, on_front
 from calibration.cli.calibrate import COMMAND
 from tofcapture.camera import Camera
-from tofcapture.devices.sim.shapes.made import BOARD_SIZE
-from tofcapture.devices.sim.shapes.made import board as simulated_board
-from tofcapture.devices.sim.shapes.mesh import circle, rectangle, volume
+from tofcapture.devices.sim.shapes import BOARD_SIZE
+from tofcapture.devices.sim.shapes import board as simulated_board
 from tofcapture.errors import ConfigError, QualityError
+from tofcapture.meshes import circle, rectangle, volume
 from tofcapture.poses import exp, invert, look_at, rotation_angle, transform_points
 
 CAMERA = Camera(240, 180, 190.6186, 200.7526, 116.8406, 101.4767)

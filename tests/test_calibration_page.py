@@ -19,8 +19,9 @@ from calibration.evidence.page.checks import check, image_medians, least_certain
 from calibration.evidence.page.content import page_content
 from calibration.evidence.page.samples import Samples, sample_recording
 from tofcapture.camera import Camera
+from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects
-from tofcapture.devices.sim.world import SimWorld, read_constants
+from tofcapture.devices.sim.world import SimWorld
 from tofcapture.errors import ConfigError, DataError, QualityError
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, View

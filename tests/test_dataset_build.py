@@ -18,9 +18,10 @@ from tofcapture.cli import main
 from tofcapture.dataset.build import build_dataset
 from tofcapture.dataset.sample import SampleConfig, assemble, make_sample
 from tofcapture.dataset.truth import class_errors, crop_shares, ground_truth_error
+from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.light import exact_view
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
-from tofcapture.devices.sim.world import SimWorld, read_constants
+from tofcapture.devices.sim.world import SimWorld
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.check import check
 from tofcapture.files.layout import MaskBit

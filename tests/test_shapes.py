@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tofcapture.devices.sim.shapes import FAMILIES
-from tofcapture.devices.sim.shapes.mesh import (
+from tofcapture.devices.sim.shapes import FAMILIES, ball
+from tofcapture.errors import ConfigError
+from tofcapture.meshes import (
     circle,
     cuboid,
     extrude,
@@ -15,12 +16,11 @@ from tofcapture.devices.sim.shapes.mesh import (
     revolve,
     settle,
     shift,
+    signed_area,
+    triangulate,
     tube,
     volume,
 )
-from tofcapture.devices.sim.shapes.polygon import signed_area, triangulate
-from tofcapture.devices.sim.shapes.turned import ball
-from tofcapture.errors import ConfigError
 
 
 def assert_closed(mesh):

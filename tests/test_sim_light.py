@@ -5,10 +5,8 @@ import pytest
 
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.light import exact_view, light_at_pixels
-from tofcapture.devices.sim.patches import cut_patches
-from tofcapture.devices.sim.render import Caster, merge
-from tofcapture.devices.sim.scene import SceneObject
-from tofcapture.devices.sim.transport import Lamp, Transport, direct, wavenumbers
+from tofcapture.devices.sim.scene import Caster, SceneObject, merge
+from tofcapture.devices.sim.transport import Lamp, Transport, cut_patches, direct, wavenumbers
 from tofcapture.errors import ConfigError
 from tofcapture.ops.phase import radial_to_range, wrapped_range
 from tofcapture.poses import rotation_exp, transform

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from tests.test_sim_world import SMALL
+from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.scenes import scene_objects
 from tofcapture.devices.sim.shapes import FAMILIES
-from tofcapture.devices.sim.world import SimWorld, read_constants
+from tofcapture.devices.sim.world import SimWorld
 from tofcapture.poses import look_at
 
 # Vertices, triangles and a checksum of the corners of every family's object of seed 3.

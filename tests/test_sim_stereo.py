@@ -7,7 +7,7 @@ import pytest
 
 from tests.test_sim_light import wall
 from tofcapture.camera import Camera
-from tofcapture.devices.sim.render import Caster, merge
+from tofcapture.devices.sim.scene import Caster, merge
 from tofcapture.devices.sim.stereo import StereoModel, ideal, point_map
 
 CAMERA = Camera(320, 256, 290.0, 290.0, 159.5, 127.5)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from tests.test_sim_light import wall
+from tofcapture.devices.sim.config import Render, load_world, read_constants
 from tofcapture.devices.sim.sensor import Sensor
 from tofcapture.devices.sim.stereo import StereoModel
-from tofcapture.devices.sim.world import Render, SimWorld, read_constants
-from tofcapture.devices.sim.worldfile import load_world, simulate
+from tofcapture.devices.sim.world import SimWorld, simulate
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.ops.phase import decode, mean_phasors
 from tofcapture.poses import rotation_angle

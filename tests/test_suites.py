@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from tofcapture.devices.sim.render import Caster, merge, unit_rays
+from tofcapture.devices.sim.scene import Caster, merge, unit_rays
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, generator
 from tofcapture.errors import ConfigError
 from tofcapture.files.manifest import object_of

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.board.geometry import Board, load_board, symmetries
 from tofcapture.command import Outcome
-from tofcapture.devices.sim.shapes.mesh import volume
+from tofcapture.meshes import volume
 from tofcapture.poses import Float64
 
 MARGIN = 10.0  # mm of paper around the outline; the scale bar lies in it

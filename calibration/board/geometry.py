@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices.sim.shapes.mesh import Mesh, circle, extrude
-from tofcapture.devices.sim.shapes.polygon import signed_area
 from tofcapture.errors import ConfigError
+from tofcapture.meshes import Mesh, circle, extrude, signed_area
 from tofcapture.poses import Float64
 
 BOARDS = Path(__file__).with_name("boards")

@@ -74,8 +74,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> Outcome:
-    from tofcapture.devices.sim.scenes import CALIBRATION
     from tofcapture.devices.station import open_station
+    from tofcapture.frames import CALIBRATION
     from tofcapture.record.recorder import record
     from tofcapture.record.scene_plan import plan_scene
 
@@ -103,7 +103,7 @@ def _metered(
 ) -> Callable[[int, int], None]:
     """Print what the board views cover after each one."""
     from tofcapture.devices.clearance import stage_of
-    from tofcapture.devices.sim.scenes import CALIBRATION
+    from tofcapture.frames import CALIBRATION
     from tofcapture.record.board_meter import meter, taken
 
     stage, rig, said = stage_of(station.config), station.rig, [-1]

@@ -24,7 +24,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> Outcome:
     import numpy as np
 
-    from tofcapture.devices.sim.worldfile import simulate
+    from tofcapture.devices.sim.world import simulate
     from tofcapture.errors import UsageError
     from tofcapture.files.view import write_view
 

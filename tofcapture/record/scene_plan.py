@@ -8,10 +8,10 @@ import numpy as np
 
 from tofcapture.devices.clearance import stage_of
 from tofcapture.devices.kinematics import arm_model
-from tofcapture.devices.sim.scenes import CALIBRATION
 from tofcapture.devices.station import Station
 from tofcapture.errors import ConfigError
 from tofcapture.files.view import check_scene_name
+from tofcapture.frames import CALIBRATION
 from tofcapture.record.plan import Plan, board_sampling, object_sampling, plan_views
 
 

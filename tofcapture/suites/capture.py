@@ -17,8 +17,9 @@ from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.sim import VERSION
 from tofcapture.devices.sim.arm import SimArm, SimClock, shared_clock
+from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.scenes import generator
-from tofcapture.devices.sim.world import SimWorld, read_constants
+from tofcapture.devices.sim.world import SimWorld
 from tofcapture.devices.station import read_station
 from tofcapture.files.seal import sealed_digest
 from tofcapture.files.view import view_path, write_view

@@ -7,11 +7,10 @@ from itertools import product
 
 import numpy as np
 
-from tofcapture.devices.sim.render import Caster
-from tofcapture.devices.sim.scene import SceneObject
+from tofcapture.devices.sim.scene import Caster, SceneObject
 from tofcapture.devices.sim.scenes import generator
-from tofcapture.devices.sim.shapes.mesh import Mesh, cuboid
-from tofcapture.devices.sim.shapes.turned import ball
+from tofcapture.devices.sim.shapes import ball
+from tofcapture.meshes import Mesh, cuboid
 from tofcapture.poses import Float64, look_at, transform
 from tofcapture.suites.recipe import Poses, Recipe, Scene
 

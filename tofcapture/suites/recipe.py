@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tofcapture.devices.sim.render import Caster
-from tofcapture.devices.sim.scene import SceneObject
+from tofcapture.devices.sim.scene import Caster, SceneObject
 from tofcapture.errors import ConfigError
 from tofcapture.poses import Float64
 

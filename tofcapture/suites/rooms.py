@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.devices.sim.render import Caster, unit_rays
-from tofcapture.devices.sim.scene import SceneObject
+from tofcapture.devices.sim.scene import Caster, SceneObject, unit_rays
 from tofcapture.devices.sim.scenes import generator
 from tofcapture.devices.sim.shapes import FAMILIES
-from tofcapture.devices.sim.shapes.mesh import Mesh, circle, cuboid, extrude, join, shift
 from tofcapture.errors import ConfigError
+from tofcapture.meshes import Mesh, circle, cuboid, extrude, join, shift
 from tofcapture.poses import Float64, look_at, rotation_exp, transform
 from tofcapture.suites.recipe import Poses, Recipe, Scene
 

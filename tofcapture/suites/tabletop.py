@@ -20,8 +20,8 @@ from tofcapture.devices.sim.scenes import (
     surroundings,
 )
 from tofcapture.devices.sim.shapes import FAMILIES
-from tofcapture.devices.sim.shapes.mesh import Mesh, cuboid
 from tofcapture.errors import ConfigError
+from tofcapture.meshes import Mesh, cuboid
 from tofcapture.suites.recipe import Recipe, Scene
 
 _PANEL = (0.26, 0.008, 0.22)  # m; length, thickness, height: within the cylinder that the arm keeps out of

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofcapture.devices.kinematics import HOME, arm_model, forward
+from tofcapture.devices.sim import hashed_generator
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 from tofcapture.frames import ArmInfo, ArmState
 from tofcapture.poses import Float64, exp
@@ -112,7 +112,7 @@ class SimArm:
 
         world = shared_world(self._context)
         key = np.round(goal, 9).tobytes()
-        error = _generator(world.seed, key).standard_normal(6) * REPEATABILITY
+        error = hashed_generator(b"arm" + str(world.seed).encode() + key).standard_normal(6) * REPEATABILITY
         world.set_pose(forward(self._model, goal) @ exp(error), key)
         travel = float(np.abs(goal - HOME).max()) / self._model.speed
         shared_clock(self._context).arrive(travel + _SETTLE)
@@ -120,11 +120,6 @@ class SimArm:
 
     def stop(self) -> None:
         """Do nothing: a simulated move is over when it returns."""
-
-
-def _generator(seed: int, key: bytes) -> np.random.Generator:
-    digest = hashlib.sha256(b"arm" + str(seed).encode() + key).digest()
-    return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32).tolist())
 
 
 def _joints(joints: ArrayLike, limit: float) -> Float64:

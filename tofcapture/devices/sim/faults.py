@@ -1,4 +1,4 @@
-"""Faults on demand: what goes wrong on a simulated station, and when, for tests of recovery.
+"""Make a simulated station fail on demand, for tests of recovery.
 
 ::
 
@@ -43,13 +43,7 @@ class FaultPlan:
 
 
 def read_faults(table: Mapping[str, Any]) -> FaultPlan:
-    """Read ``[sim.faults]``.
-
-    Raises
-    ------
-    ConfigError
-        Unknown keys, or anything but lists of burst numbers and non-negative numbers.
-    """
+    """Read ``[sim.faults]``; :class:`ConfigError` on unknown keys, and anything but lists of burst numbers or numbers."""
     known = {f.name: f.default for f in fields(FaultPlan)}
     values: dict[str, Any] = {}
     for key, value in table.items():
@@ -57,26 +51,21 @@ def read_faults(table: Mapping[str, Any]) -> FaultPlan:
             raise ConfigError(
                 f"[sim.faults] does not know {key}", hint=f"it knows {', '.join(sorted(known))}"
             )
-        number = isinstance(value, int | float) and not isinstance(value, bool) and value >= 0
-        numbers = isinstance(value, list) and all(type(k) is int and k >= 0 for k in value)
-        wants_list = isinstance(known[key], tuple)
-        if not (numbers if wants_list else number):
-            expected = "a list of burst numbers" if wants_list else "a number from 0 on"
+        if isinstance(known[key], tuple):
+            good, expected = (
+                isinstance(value, list) and all(type(k) is int and k >= 0 for k in value),
+                "a list of burst numbers",
+            )
+        else:
+            good, expected = type(value) in (int, float) and value >= 0, "a number from 0 on"
+        if not good:
             raise ConfigError(f"[sim.faults] {key}: expected {expected}, got {value!r}")
-        values[key] = tuple(value) if wants_list else float(value)
+        values[key] = tuple(value) if isinstance(value, list) else float(value)
     return FaultPlan(**values)
 
 
 class Faults:
-    """The faults of one open station.
-
-    Parameters
-    ----------
-    plan
-        What goes wrong when.
-    sleep
-        Replaced in tests.
-    """
+    """The faults of one open station; ``sleep`` is how slow devices wait."""
 
     def __init__(self, plan: FaultPlan, sleep: Callable[[float], None] = time.sleep) -> None:
         self._plan, self._sleep = plan, sleep
@@ -90,31 +79,21 @@ class Faults:
         return burst in when and burst < self._plan.until
 
     def before_move(self) -> None:
-        """Called before the arm moves.
-
-        Raises
-        ------
-        MotionRefused
-            As planned, once before each listed burst.
-        """
+        """Refuse a move as planned, once before each listed burst; raises :class:`MotionRefused`."""
         self.offset = np.eye(4)
         if self._strikes(self._plan.arm_refuses, self._bursts) and self._bursts not in self._refused:
             self._refused.add(self._bursts)
             raise MotionRefused(f"fault on demand: the arm refuses to move before burst {self._bursts}")
 
     def before_burst(self) -> None:
-        """Called before the ToF camera captures; :class:`DeviceError` as planned."""
+        """Lose the burst that the ToF camera is about to take, as planned; raises :class:`DeviceError`."""
         burst, self._bursts = self._bursts, self._bursts + 1
         self._wait(burst)
         if self._strikes(self._plan.tof_drops, burst):
             raise DeviceError(f"fault on demand: the ToF camera lost burst {burst}")
 
     def before_points(self) -> bool:
-        """Called before the stereo camera captures; moves the arm as planned.
-
-        Returns
-        -------
-        Whether the point map is to be empty.
+        """Move the arm before the stereo camera captures, as planned; tells whether the point map is to be empty.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What light reaches each pixel of the ToF camera: phasors of direct and indirect light, before any electronics.
+"""The light that reaches each pixel of the ToF camera: phasors, direct and indirect, before any electronics.
 
 A pixel is an area: sub-pixel samples are added as phasors, so that a pixel on an edge mixes foreground and background
 (a flying pixel) as a real one does. Pixels on one smooth, evenly lit surface need fewer samples than those on an edge.
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.devices.sim.render import Caster, Float32, unit_rays
+from tofcapture.devices.sim.scene import Caster, Float32, Int64, unit_rays
 from tofcapture.devices.sim.transport import Complex64, Lamp, Transport, direct, turn, wavenumbers
 from tofcapture.poses import Float64, invert, rotate_vectors
 
@@ -48,10 +48,8 @@ class _Samples:
     found: NDArray[np.bool_]
 
 
-def _look(
-    caster: Caster, camera: Camera, T_world_camera: Float64, pixels: NDArray[np.int64] | None = None
-) -> _Samples:
-    """What the rays of all pixels meet, or of those with the given flat indices."""
+def _look(caster: Caster, camera: Camera, T_world_camera: Float64, pixels: Int64 | None = None) -> _Samples:
+    """Find what the rays of all pixels meet, or of those with the given flat indices."""
     directions = unit_rays(camera, T_world_camera)
     directions = directions if pixels is None else directions[pixels]
     eye = T_world_camera[:3, 3].astype(np.float32)
@@ -68,7 +66,7 @@ def _look(
 def exact_view(
     caster: Caster, camera: Camera, T_world_camera: Float64
 ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
-    """What an ideal camera of these intrinsics would measure at its pixel centres.
+    """Measure as an ideal camera of these intrinsics would, at its pixel centres.
 
     Returns
     -------
@@ -115,20 +113,14 @@ def light_at_pixels(
 
     Parameters
     ----------
-    caster
-        The scene.
-    camera, T_world_tof
-        Intrinsics and pose of the ToF camera.
-    lamp
-        The illuminator, world frame.
-    hz
-        Modulation frequencies, ascending.
+    caster, camera, T_world_tof
+        The scene, intrinsics and pose of the ToF camera.
+    lamp, hz
+        The illuminator, world frame; modulation frequencies, ascending.
     transport
         Light between surfaces; ``None`` leaves direct light only.
-    subpixels
-        Each pixel is sampled on ``subpixels x subpixels`` points.
-    rays
-        Rays of the last indirect bounce, per pixel.
+    subpixels, rays
+        Points per pixel along each axis; rays of the last indirect bounce, per pixel.
     """
     k = wavenumbers(hz)
     eye = _Eye(caster, camera, T_world_tof, lamp, k)
@@ -156,8 +148,8 @@ class _Eye:
     lamp: Lamp
     k: tuple[float, ...]
 
-    def look(self, subpixels: int, pixels: NDArray[np.int64]) -> tuple[_Samples, Complex64]:
-        """Samples of the given pixels, pixel by pixel, and the direct irradiance (len(k), N) there."""
+    def look(self, subpixels: int, pixels: Int64) -> tuple[_Samples, Complex64]:
+        """Sample the given pixels, pixel by pixel; with the direct irradiance (len(k), N) there."""
         own = None if subpixels == 1 else _within(self.camera, subpixels, pixels)
         samples = _look(self.caster, self.camera.scaled(subpixels), self.T_world_camera, own)
         seen = np.flatnonzero(samples.found)
@@ -166,25 +158,20 @@ class _Eye:
         return samples, out
 
 
-def _within(camera: Camera, subpixels: int, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Flat indices, in the image ``subpixels`` times as fine, of the samples of each pixel, one pixel after the other."""
+def _within(camera: Camera, subpixels: int, pixels: Int64) -> Int64:
+    """List flat indices, in the image ``subpixels`` times as fine, of the samples of each pixel, one pixel after the other."""
     v, u = pixels // camera.width, pixels % camera.width
     step = np.arange(subpixels)
     rows = (v[:, None] * subpixels + step)[:, :, None] * (camera.width * subpixels)
-    out: NDArray[np.int64] = rows + (u[:, None] * subpixels + step)[:, None, :]
+    out: Int64 = rows + (u[:, None] * subpixels + step)[:, None, :]
     return out.reshape(-1)
 
 
 def _means(
-    samples: _Samples,
-    irradiance: Complex64,
-    indirect: Complex64 | None,
-    coarse: _Samples,
-    camera: Camera,
-    pixels: NDArray[np.int64],
-    k: Sequence[float],
-) -> NDArray[np.complex128]:
-    """(len(k), P) mean over each pixel's samples of albedo times irradiance, turned by the way back to the camera."""
+    samples: _Samples, irradiance: Complex64, indirect: Complex64 | None, coarse: _Samples, camera: Camera,
+    pixels: Int64, k: Sequence[float],
+) -> NDArray[np.complex128]:  # fmt: skip
+    """Average albedo times irradiance, turned by the way back to the camera, over each pixel's samples: (len(k), P)."""
     if not len(pixels):
         return np.zeros((len(k), 0), dtype=np.complex128)
     own = np.repeat(pixels, len(samples.points) // len(pixels))
@@ -199,7 +186,7 @@ def _means(
 
 
 def _broken(samples: _Samples, lit: NDArray[np.bool_], camera: Camera, subpixels: int) -> NDArray[np.bool_]:
-    """(H * W,) pixels with a sample beside another surface, another albedo or the edge of a shadow."""
+    """Mark pixels (H * W,) with a sample beside another surface, another albedo or the edge of a shadow."""
     (H, W), s = camera.shape, subpixels
 
     def image(values: NDArray[Any]) -> NDArray[Any]:
@@ -224,7 +211,7 @@ def _broken(samples: _Samples, lit: NDArray[np.bool_], camera: Camera, subpixels
 
 
 def _indirect(coarse: _Samples, camera: Camera, lamp: Lamp, transport: Transport, rays: int) -> Complex64:
-    """Indirect irradiance (K, H * W) at the pixel centres, denoised over the interleaving tile."""
+    """Compute indirect irradiance (K, H * W) at the pixel centres, denoised over the interleaving tile."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
     pattern = ((v % _TILE) * _TILE + u % _TILE).reshape(-1)
     seen = np.flatnonzero(coarse.found)
@@ -262,8 +249,8 @@ def _filter(h: Complex64, samples: _Samples, camera: Camera) -> Complex64:
     return mean.astype(np.complex64).reshape(h.shape)
 
 
-def _nearest(coarse: _Samples, fine: _Samples, own: NDArray[np.int64], camera: Camera) -> NDArray[np.int64]:
-    """Flat index of the nearest pixel centre that lies on the surface of each sample; ``own`` is the sample's pixel."""
+def _nearest(coarse: _Samples, fine: _Samples, own: Int64, camera: Camera) -> Int64:
+    """Find the nearest pixel centre on the surface of each sample, as flat index; ``own`` is the sample's pixel."""
     H, W = camera.shape
     choice = own.copy()
     cost = _unlike(fine, np.arange(len(own)), coarse, own)
@@ -280,8 +267,8 @@ def _nearest(coarse: _Samples, fine: _Samples, own: NDArray[np.int64], camera: C
     return choice
 
 
-def _unlike(fine: _Samples, i: NDArray[np.int64], coarse: _Samples, j: NDArray[np.int64]) -> Float32:
-    """How little sample i and pixel centre j belong to one surface: normals apart plus distance off the plane."""
+def _unlike(fine: _Samples, i: Int64, coarse: _Samples, j: Int64) -> Float32:
+    """Measure how little sample i and pixel centre j belong to one surface: normals apart plus distance off the plane."""
     offset = fine.points[i] - coarse.points[j]
     gap = np.abs(np.einsum("ij,ij->i", offset, coarse.normals[j])) / np.maximum(fine.distance[i], 1e-6)
     turn = 1 - np.einsum("ij,ij->i", fine.normals[i], coarse.normals[j])

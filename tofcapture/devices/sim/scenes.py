@@ -1,13 +1,11 @@
-"""What stands on the simulated table, by name.
+"""Scenes of the simulated table, by name.
 
-The world is the arm's base frame. The table top lies half a metre below the base, on a pedestal's foot as it were: a UR10e then
-reaches three quarters of the directions within 65 deg of vertical at 0.8 m and still half of them at 1.4 m, against a quarter
-and an eighth for a table at the height of the base.
+The world is the arm's base frame. The table top lies half a metre below the base: a UR10e then reaches three quarters of the
+directions within 65 deg of vertical at 0.8 m and half of them at 1.4 m, against a quarter and an eighth at the base's height.
 """
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -15,16 +13,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofcapture.devices.sim.meshes import read_mesh
+from tofcapture.devices.sim import hashed_generator
 from tofcapture.devices.sim.scene import SceneObject
-from tofcapture.devices.sim.shapes import FAMILIES
-from tofcapture.devices.sim.shapes.made import board
-from tofcapture.devices.sim.shapes.mesh import Mesh, circle, cuboid, extrude, move, settle
-from tofcapture.devices.sim.shapes.turned import ball
+from tofcapture.devices.sim.shapes import FAMILIES, ball, board
 from tofcapture.errors import ConfigError
+from tofcapture.frames import CALIBRATION
+from tofcapture.meshes import (
+    SUFFIXES,
+    Mesh,
+    cuboid,
+    cylinder,
+    extrude,
+    move,
+    read_mesh,
+    settle,
+)
 from tofcapture.poses import Float64, rotation_exp, transform
 
-CALIBRATION = "calibration"
 TABLE_CENTRE: Float64 = np.array([0.70, 0.0, -0.50])  # m, base frame, on the table top
 BOARD_CENTRE = np.array([0.70, 0.0, -0.22])
 BOARD_TILT = np.radians(-15.0)  # about base y: the board leans towards the arm
@@ -34,21 +39,24 @@ _REACH = 0.33  # m; targets stay within this disc about the table's centre
 
 
 def on_table(x: float, y: float) -> Float64:
-    """(3,) point of the table top, from its centre, metres."""
-    out: Float64 = TABLE_CENTRE + [x, y, 0.0]  # noqa: RUF005  an addition of numbers
-    return out
+    """Point (3,) at the table top, from its centre, metres."""
+    return TABLE_CENTRE + np.array([x, y, 0.0])
 
 
 def generator(name: str, seed: int, purpose: str) -> np.random.Generator:
-    """Independent generator for one purpose of one scene; the same on every machine."""
-    digest = hashlib.sha256(f"{purpose}|{seed}|{name}".encode()).digest()
-    return np.random.default_rng(np.frombuffer(digest, dtype="<u4").tolist())
+    """Make an independent generator for one purpose of one scene."""
+    return hashed_generator(f"{purpose}|{seed}|{name}".encode())
+
+
+def mesh_files(folder: Path) -> list[Path]:
+    """List the mesh files of a folder, sorted."""
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
 
 
 def scene_objects(
     name: str, seed: int, meshes: Mapping[str, Path] | None = None, mesh_unit: str = "m"
 ) -> list[SceneObject]:
-    """Everything that stands in a scene, in the base frame.
+    """Put everything into a scene, in the base frame.
 
     Parameters
     ----------
@@ -57,15 +65,12 @@ def scene_objects(
         it (``mug``, ``mug-2``); anything else is a seeded combination of one to four objects (``random-7``).
     seed
         The world's seed.
-    meshes
-        Name -> PLY, OBJ or STL file.
-    mesh_unit
-        Unit of those files: ``m``, ``cm`` or ``mm``.
+    meshes, mesh_unit
+        Name -> PLY, OBJ or STL file, and their unit: ``m``, ``cm`` or ``mm``.
 
     Returns
     -------
-    list of SceneObject
-        Objects (``target=True``), then table, pedestal, walls and clutter.
+    Objects (``target=True``), then table, pedestal, walls and clutter.
     """
     if name == CALIBRATION:
         return [*_calibration(), *surroundings(name, seed, clutter=False)]
@@ -78,7 +83,7 @@ def scene_objects(
 
 
 def _families(name: str, rng: np.random.Generator) -> list[str]:
-    """Families of a scene's objects."""
+    """Choose the families of a scene's objects."""
     stem = re.sub(r"-\d+$", "", name)
     if stem in FAMILIES:
         return [stem]
@@ -124,7 +129,7 @@ def arranged(
 def _free_place(
     radius: float, discs: Sequence[tuple[Float64, float]], rng: np.random.Generator
 ) -> Float64 | None:
-    """(2,) place near the centre where a disc touches no other, or None when forty tries find none; the first is central."""
+    """Find a place (2,) near the centre where a disc touches no other, the first central; None after forty tries."""
     if not discs:
         near: Float64 = rng.uniform(-0.02, 0.02, 2)
         return near
@@ -145,19 +150,17 @@ def solid(
 
 
 def _calibration() -> list[SceneObject]:
-    """Board with cut-outs on a stand, and four solids whose slopes hold a registration in the board's plane.
+    """Stand the board with cut-outs up, and four solids whose slopes hold a registration in the board's plane.
 
     The board leans towards the arm, well above the table, so that cut-outs and outline stand before a clear background;
     nothing faces its front, so hardly any light reaches it by way of other surfaces.
     """
     plate = move(board(), transform(np.eye(3), [0, 0, -0.005]))
     block = move(cuboid(0.16, 0.12, 0.10), transform(rotation_exp([0.6, 0.0, 0.0]), [0, 0, 0]))
-    pyramid = extrude(circle(0.11, segments=5), 0.16)
+    pyramid = cylinder(0.11, 0.16, segments=5)
     pyramid = (pyramid[0] * np.where(pyramid[0][:, 2:] > 0, [0.25, 0.25, 1], [1.0, 1.0, 1]), pyramid[1])
-    ridge = move(
-        extrude(np.array([[-0.1, 0], [0.1, 0], [0.0, 0.1]]), 0.18),
-        transform(rotation_exp([np.pi / 2, 0, 0]), [0, 0, 0]),
-    )
+    roof = extrude(np.array([[-0.1, 0], [0.1, 0], [0.0, 0.1]]), 0.18)
+    ridge = move(roof, transform(rotation_exp([np.pi / 2, 0, 0]), [0, 0, 0]))
     return [
         solid("board", plate, 0.7, BOARD_CENTRE, (0, BOARD_TILT, 0), target=True),
         *(_leg(x, y) for x, y in ((-0.06, 0.04), (0.12, 0.05), (-0.03, -0.16))),
@@ -165,19 +168,19 @@ def _calibration() -> list[SceneObject]:
         solid("block", settle(block), 0.45, on_table(-0.13, 0.40), (0, 0, 0.5), target=True),
         solid("pyramid", settle(pyramid), 0.65, on_table(-0.10, -0.38), (0, 0, 0.3), target=True),
         solid("ridge", settle(ridge), 0.5, on_table(0.15, -0.38), (0, 0, 0.8), target=True),
-        solid("peg", extrude(circle(0.05, segments=48), 0.12), 0.55, on_table(0.36, 0.02), target=True),
+        solid("peg", cylinder(0.05, 0.12, 48), 0.55, on_table(0.36, 0.02), target=True),
     ]  # fmt: skip
 
 
 def _leg(x: float, y: float) -> SceneObject:
-    """Round leg under the board's point (x, y), between cut-outs; ends 3 mm below the plate."""
+    """Put a round leg under the board's point (x, y), between cut-outs; ends 3 mm below the plate."""
     foot = on_table(x * np.cos(BOARD_TILT), y)
     height = BOARD_CENTRE[2] - TABLE_CENTRE[2] - x * np.sin(BOARD_TILT) - 0.005 - 0.003 - 0.004
-    return solid("leg", extrude(circle(0.012, segments=24), height), 0.5, foot)
+    return solid("leg", cylinder(0.012, height, 24), 0.5, foot)
 
 
 def surroundings(name: str, seed: int, *, clutter: bool) -> list[SceneObject]:
-    """Table, pedestal, floor, walls and boxes; where and how bright differs from scene to scene."""
+    """Add table, pedestal, floor, walls and boxes; where and how bright differs from scene to scene."""
     rng = generator(name, seed, "surroundings")
     x, y, z = TABLE_CENTRE
     out = [
@@ -186,11 +189,8 @@ def surroundings(name: str, seed: int, *, clutter: bool) -> list[SceneObject]:
         solid("floor", cuboid(6, 6, 0.1), rng.uniform(0.15, 0.6), [x, y, _FLOOR - 0.1]),
     ]
     if not clutter or rng.random() < 0.85:
-        out.append(
-            solid(
-                "back wall", cuboid(0.1, 6, 3.2), rng.uniform(0.3, 0.85), [rng.uniform(1.9, 3.0), 0, _FLOOR]
-            )
-        )
+        albedo = rng.uniform(0.3, 0.85)
+        out.append(solid("back wall", cuboid(0.1, 6, 3.2), albedo, [rng.uniform(1.9, 3.0), 0, _FLOOR]))
     for side in (-1, 1):
         if rng.random() < 0.5:
             far = side * rng.uniform(1.4, 2.6)
@@ -201,7 +201,7 @@ def surroundings(name: str, seed: int, *, clutter: bool) -> list[SceneObject]:
 
 
 def _clutter(rng: np.random.Generator) -> SceneObject:
-    """One box, at the table's far edges or on the floor behind it."""
+    """Add one box, at the table's far edges or on the floor behind it."""
     side = rng.choice([-1.0, 1.0])
     turn = (0.0, 0.0, rng.uniform(-np.pi, np.pi))
     if rng.random() < 0.5:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from tofcapture.devices.sim.light import Light
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
-from tofcapture.ops.phase import Complex128, frequencies, radius_px
+from tofcapture.ops.phase import Complex128, frequencies
 from tofcapture.ops.phase.phasors import solution
 from tofcapture.poses import Float64
-from tofcapture.rig import SPEED_OF_LIGHT, RangeError, image_places
+from tofcapture.rig import SPEED_OF_LIGHT, RangeError, image_places, radius_px
 
 _FEW = 200.0  # electrons; below, shot noise is drawn from the Poisson distribution itself
 
@@ -31,18 +31,15 @@ class Sensor:
     ----------
     modulation_hz, phase_rad
         (K,) frequency and demodulation phase of each raw channel.
-    signal
-        Raw units that a white surface (albedo 1) facing the camera at 1 m adds to each tap in the nominal exposure.
+    signal, ambient
+        Raw units that a white surface (albedo 1) facing the camera at 1 m adds to each tap in the nominal exposure; raw units
+        added to each tap, not modulated.
     contrast
         (F,) demodulation contrast A / B of each frequency, ascending.
     exposure, nominal_exposure
         Seconds; the signal scales with their ratio.
-    ambient
-        Raw units added to each tap, not modulated.
-    electrons_per_unit
-        Photo-electrons per raw unit.
-    read_noise
-        Electrons, standard deviation, per tap.
+    electrons_per_unit, read_noise
+        Photo-electrons per raw unit; electrons, standard deviation, per tap.
     full_scale
         Largest raw value; taps clip there.
     range_errors
@@ -55,10 +52,8 @@ class Sensor:
         Share of the light that the lens scatters, and the scale of its halo as a share of the image width.
     celsius, celsius_drift
         Mean temperature and standard deviation of its frame-to-frame wander.
-    quantise
-        Round to whole raw units and clip at ``full_scale``; otherwise raw is float64.
-    shot_noise
-        Draw Poisson numbers of electrons.
+    quantise, shot_noise
+        Round to whole raw units and clip at ``full_scale``, else raw is float64; draw Poisson numbers of electrons.
     """
 
     modulation_hz: tuple[float, ...] = PAPER_MODULATION_HZ
@@ -85,10 +80,7 @@ class Sensor:
 def check_channels(sensor: Sensor, where: str) -> None:
     """Refuse channels that no decoder could take, and range errors of frequencies that the sensor does not have.
 
-    Raises
-    ------
-    ConfigError
-        Naming the key and what it should hold.
+    :class:`ConfigError` names the key and what it should hold.
     """
     hz, K = frequencies(sensor.modulation_hz), len(sensor.modulation_hz)
     if len(sensor.phase_rad) != K or len(sensor.contrast) != len(hz):
@@ -127,7 +119,7 @@ def ideal(sensor: Sensor) -> Sensor:
 
 @lru_cache(maxsize=4)
 def _halo_spectrum(H: int, W: int, radius: float) -> tuple[Complex128, tuple[int, int]]:
-    """Spectrum of the halo and the size of the transform.
+    """Compute the spectrum of the halo, and the size of the transform.
 
     Only the image itself is kept of the convolution, so a period of ``2 H - 1`` is enough: what wraps around falls outside.
     """
@@ -140,16 +132,9 @@ def _halo_spectrum(H: int, W: int, radius: float) -> tuple[Complex128, tuple[int
 
 
 def scatter(image: NDArray[Any], share: float, radius: float) -> NDArray[Any]:
-    """Lens scattering: ``z + share (z * h)`` with a broad Lorentzian halo h of unit sum (method.md 4.4).
+    """Scatter an image (..., H, W), real or complex: ``z + share (z * h)`` with a Lorentzian halo h of unit sum.
 
-    Parameters
-    ----------
-    image
-        (..., H, W) real or complex.
-    share
-        Scattered energy.
-    radius
-        Half width of the halo as a share of the image width.
+    ``radius`` is the halo's half width as a share of the image width (method.md 4.4).
     """
     if share == 0:
         return image
@@ -167,18 +152,12 @@ def scatter(image: NDArray[Any], share: float, radius: float) -> NDArray[Any]:
 def expose(
     light: Light, sensor: Sensor, info: TofInfo, frames: int, rng: np.random.Generator, serial: int
 ) -> tuple[NDArray[Any], Float64]:
-    """Take a static burst.
+    """Take a static burst of ``frames`` frames.
 
     Parameters
     ----------
-    light
-        What reaches the pixels.
-    sensor
-        The electronics.
-    info
-        Channels and intrinsics of the camera.
-    frames
-        Frames in the burst.
+    light, sensor, info
+        What reaches the pixels, the electronics, channels and intrinsics.
     rng
         Noise of this burst.
     serial
@@ -206,7 +185,7 @@ def expose(
 
 
 def _noisy(taps: Float64, sensor: Sensor, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Taps with shot and read noise, from one draw of normal numbers.
+    """Add shot and read noise to taps, from one draw of normal numbers.
 
     The sum of a Poisson number of mean L and read noise of variance s^2 has mean L, variance V = L + s^2 and third
     cumulant L. The normal number z is bent to have all three (Cornish and Fisher): ``L + sqrt(V) z + L / (6 V) (z^2 - 1)``.
@@ -228,7 +207,7 @@ def _noisy(taps: Float64, sensor: Sensor, rng: np.random.Generator) -> NDArray[n
 def _taps(
     phasor: Complex128, mean: Float64, sensor: Sensor, info: TofInfo, fixed: Float64, celsius: Float64
 ) -> Float64:
-    """Noise-free taps (frames, K, H, W) of a burst.
+    """Compute noise-free taps (frames, K, H, W) of a burst.
 
     Temperature turns all phases of a frequency by one angle a frame, so cosines are taken once a burst.
     """
@@ -250,7 +229,7 @@ def _taps(
 
 
 def _wave(x: Float64, warm: Float64, harmonics: tuple[tuple[int, float], ...]) -> Float64:
-    """(frames, H, W) correlation waveform at ``x (H, W) + warm (frames,)``."""
+    """Evaluate the correlation waveform (frames, H, W) at ``x (H, W) + warm (frames,)``."""
     total = np.zeros((len(warm), *x.shape))
     for m, a in ((1, 1.0), *harmonics):
         cosine, sine = a * np.cos(m * x), a * np.sin(m * x)

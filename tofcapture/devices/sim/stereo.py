@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.devices.sim.render import Caster, lift, unit_rays
+from tofcapture.devices.sim.scene import Caster, Float32, lift, unit_rays
 from tofcapture.poses import Float64, transform_points
-
-Float32 = NDArray[np.float32]
 
 _CHUNK = 65_536  # pixels at a time: what they need stays in the cache
 
@@ -24,20 +21,13 @@ class StereoModel:
     ----------
     baseline
         Distance of the right eye along x, metres.
-    disparity_noise
-        Standard deviation in pixels, after matching; depth noise is ``z^2 / (f b)`` times it.
-    correlation
-        Standard deviation in pixels of the Gaussian that correlates the noise, the matching window's doing.
-    grazing
-        Surfaces seen at more than this angle from their normal are lost, radians.
-    darkest
-        Surfaces with a lower albedo are lost.
-    edge_outliers
-        Share of points beside a depth edge that are matched wrongly.
-    dropout
-        Share of points lost anywhere.
-    far
-        Points beyond this depth are lost, metres.
+    disparity_noise, correlation
+        Standard deviations in pixels: of disparities after matching (depth noise is ``z^2 / (f b)`` times it), and of the
+        Gaussian that correlates the noise, the matching window's doing.
+    grazing, darkest, far
+        Lost are surfaces seen at more than this angle from their normal, radians, of a lower albedo, or deeper, metres.
+    edge_outliers, dropout
+        Shares of points beside a depth edge that are matched wrongly, and of points lost anywhere.
     """
 
     baseline: float = 0.10
@@ -58,18 +48,7 @@ def ideal(model: StereoModel) -> StereoModel:
 def point_map(
     caster: Caster, camera: Camera, T_world_stereo: Float64, model: StereoModel, rng: np.random.Generator
 ) -> Float32:
-    """Measure one point map.
-
-    Parameters
-    ----------
-    caster
-        The scene.
-    camera, T_world_stereo
-        Intrinsics and pose of the left eye, whose grid the map lies on.
-    model
-        Constants.
-    rng
-        Noise of this frame.
+    """Measure one point map, on the grid of the left eye that ``camera`` and ``T_world_stereo`` describe.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Light between surfaces, as phasors, until it has converged.
+"""Light between surfaces, as phasors, until it has converged; and the patches that surfaces are cut into for it.
 
 Light that has travelled L metres and is modulated at f carries the phase ``k L`` with ``k = 2 pi f / c``. With h the irradiance
 phasor of a surface per unit of radiant intensity of the illuminator (1/m^2), Lambertian surfaces obey
@@ -6,8 +6,8 @@ phasor of a surface per unit of radiant intensity of the illuminator (1/m^2), La
     h(x) = cos(theta) / d^2 exp(i k d) V(x)  +  mean over cosine-weighted directions of  rho(y) h(y) exp(i k |x - y|)
 
 (the rendering equation, linear in the phasor; k = 0 gives the steady light that only adds to the taps' mean). Between surfaces the
-operator depends on the scene alone: patches and their ray-cast transport matrix are made once per scene. A view adds its own source
-term, solves, and gathers the last bounce at every pixel with rays, so that near fields and contact edges are exact.
+operator depends on the scene alone: patches and their ray-cast transport matrix are made once per scene. A view adds its own
+source term, solves, and gathers the last bounce at every pixel with rays, so that near fields and contact edges are exact.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices.sim.patches import cut_patches
-from tofcapture.devices.sim.render import Caster, Float32, Hits, Int64, lift
+from tofcapture.devices.sim.scene import Caster, Float32, Geometry, Hits, Int64, lift
 from tofcapture.rig import SPEED_OF_LIGHT
 
 Complex64 = NDArray[np.complex64]
@@ -50,7 +49,7 @@ class Lamp:
     edge: float = 0.0
 
     def strength(self, towards: Float32) -> Float32 | float:
-        """(N,) intensity in unit directions (N, 3) away from the lamp, 1 on the axis."""
+        """Compute the intensity in unit directions (N, 3) away from the lamp, 1 on the axis."""
         if self.half_angle >= np.pi:
             return 1.0
         angle = np.arccos(np.clip(towards @ self.axis.astype(np.float32), -1, 1))
@@ -60,7 +59,7 @@ class Lamp:
 
 
 def wavenumbers(hz: Sequence[float]) -> tuple[float, ...]:
-    """``2 pi f / c`` of each frequency, with 0 (steady light) in front; radians per metre of path."""
+    """Compute ``2 pi f / c`` of each frequency, with 0 (steady light) in front; radians per metre of path."""
     return (0.0, *(2 * np.pi * f / SPEED_OF_LIGHT for f in hz))
 
 
@@ -96,18 +95,9 @@ def _cosine_directions(normals: Float32, u: NDArray[Any], v: NDArray[Any]) -> Fl
 def direct(
     caster: Caster, points: NDArray[Any], normals: Float32, lamp: Lamp, k: Sequence[float]
 ) -> Complex64:
-    """Irradiance phasors straight from a point light.
+    """Compute irradiance phasors straight from a point light.
 
-    Parameters
-    ----------
-    caster
-        The scene.
-    points, normals
-        (N, 3), world frame; the normal names the side that is looked at.
-    lamp
-        The light.
-    k
-        Wavenumbers, radians per metre.
+    ``points`` and ``normals`` are (N, 3), world frame; the normal names the side that is looked at. ``k`` are wavenumbers.
 
     Returns
     -------
@@ -137,32 +127,117 @@ def _lit(
 
 
 def turn(phase: NDArray[Any]) -> Complex64:
-    """``exp(i phase)``."""
+    """Compute ``exp(i phase)``."""
     out = np.empty(phase.shape, dtype=np.complex64)
     out.real, out.imag = np.cos(phase), np.sin(phase)
     return out
 
 
+@dataclass(frozen=True)
+class Patches:
+    """The surfaces cut into patches: each triangle in n x n barycentric cells, neighbouring cells of like normal joined.
+
+    Attributes
+    ----------
+    divisions, first
+        (M,) n of each triangle, and where its cells begin in ``patch_of_cell``.
+    patch_of_cell
+        (C,) patch of each cell; -1 for cells outside the triangle.
+    cells, cell_area
+        (S,) indices of real cells, sorted by patch, and their areas, m^2.
+    start
+        (P + 1,) where each patch begins in ``cells``.
+    """
+
+    divisions: Int64
+    first: Int64
+    patch_of_cell: Int64
+    cells: Int64
+    cell_area: NDArray[np.float64]
+    start: Int64
+
+    @property
+    def count(self) -> int:
+        """Count the patches; each has two sides."""
+        return len(self.start) - 1
+
+    def side_of(self, geometry: Geometry, hits: Hits, directions: NDArray[Any]) -> Int64:
+        """Name the ``2 * patch + side`` (N,) that each ray met, -1 for none; side 0 is the one the winding normal points to."""
+        found = hits.found
+        tri = hits.triangle if found.all() else np.where(found, hits.triangle, 0)
+        n = self.divisions[tri]
+        u, v = (np.clip(hits.uv[:, a], 0.0, 1.0) * n.astype(np.float32) for a in (0, 1))
+        i, j = (np.minimum(x.astype(np.int64), n - 1) for x in (u, v))
+        upper = (u - i) + (v - j) > 1.0
+        # Rounding may put a hit on the hypotenuse just outside: pull it back into the triangle.
+        j = np.minimum(j, n - 1 - i)
+        upper &= i + j < n - 1
+        patch = self.patch_of_cell[self.first[tri] + (i * n + j) * 2 + upper]
+        normals = geometry.normals[tri]
+        behind = np.einsum("ij,ij->i", normals, np.asarray(directions, dtype=np.float32)) > 0
+        return np.where(found, 2 * patch + behind, -1)
+
+
+def cut_patches(geometry: Geometry, budget: int, least: int = 150) -> Patches:
+    """Cut a scene into about ``budget`` patches, shared by area.
+
+    No object gets fewer than ``least``, so that a small object on a large table still has a shape.
+    """
+    edges = geometry.corners[:, [1, 2, 0]] - geometry.corners
+    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
+    objects = int(geometry.owner.max()) + 1
+    object_area = np.bincount(geometry.owner, weights=area, minlength=objects)
+    wanted = np.maximum(budget * object_area / area.sum(), least)
+    size = np.sqrt(object_area / wanted)[geometry.owner]
+    n = np.clip(np.ceil(longest / size), 1, 256).astype(np.int64)
+    first = np.concatenate([[0], np.cumsum(2 * n**2)])[:-1]
+    tri, i, j, upper = _cells(n)
+    index = first[tri] + (i * n[tri] + j) * 2 + upper
+    third = (1 + upper) / 3
+    u, v = (i + third) / n[tri], (j + third) / n[tri]
+    a, b, c = (geometry.corners[tri, k] for k in range(3))
+    centre = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    voxel = np.floor(centre / size[tri, None]).astype(np.int64)
+    axis = np.abs(geometry.normals[tri]).argmax(axis=1)
+    sign = np.take_along_axis(geometry.normals[tri], axis[:, None], axis=1)[:, 0] > 0
+    key = np.column_stack([geometry.owner[tri], voxel, 2 * axis + sign])
+    _, patch = np.unique(key, axis=0, return_inverse=True)
+    patch = patch.reshape(-1)
+    order = np.argsort(patch, kind="stable")
+    patch_of_cell = np.full(int((2 * n**2).sum()), -1, dtype=np.int64)
+    patch_of_cell[index] = patch
+    return Patches(
+        divisions=n,
+        first=first,
+        patch_of_cell=patch_of_cell,
+        cells=index[order],
+        cell_area=(area[tri] / n[tri] ** 2)[order],
+        start=np.searchsorted(patch[order], np.arange(patch.max() + 2)),
+    )
+
+
+def _cells(n: Int64) -> tuple[Int64, Int64, Int64, Int64]:
+    """List triangle, row, column and half of every barycentric cell that lies inside its triangle."""
+    tri = np.repeat(np.arange(len(n)), 2 * n**2)
+    within = np.arange(len(tri)) - np.repeat(np.cumsum(2 * n**2) - 2 * n**2, 2 * n**2)
+    upper, square = within % 2, within // 2
+    i, j = square // n[tri], square % n[tri]
+    inside = i + j + upper < n[tri]
+    return tri[inside], i[inside], j[inside], upper[inside]
+
+
 class Transport:
     """Multiple bounces of one scene: patches and the matrices between them, made once.
 
-    Parameters
-    ----------
-    caster
-        The scene.
-    hz
-        Modulation frequencies.
-    budget, rays
-        Patches, and rays per side of a patch.
+    ``hz`` are modulation frequencies; ``budget`` and ``rays`` are numbers of patches, and of rays per side of a patch.
     """
 
     def __init__(self, caster: Caster, hz: Sequence[float], budget: int = 2500, rays: int = 256) -> None:
         self.caster = caster
         self.k = wavenumbers(hz)
         self.patches = cut_patches(caster.geometry, budget)
-        self._rng = np.random.default_rng(
-            20_100
-        )  # the scene's own numbers: the same scene gives the same matrices
+        self._rng = np.random.default_rng(20_100)  # the same scene gives the same matrices
         points, normals, albedo = self._sample(rays)
         self._points, self._normals = points, normals
         self._rays = rays
@@ -170,7 +245,7 @@ class Transport:
         self.matrices = self._trace(points, normals)
 
     def _sample(self, rays: int) -> tuple[Float32, Float32, Float32]:
-        """``rays`` points on each side of each patch, spread by area; (2P * rays, 3), normals, and albedo (2P,)."""
+        """Spread ``rays`` points on each side of each patch by area: (2P * rays, 3), normals, and albedo (2P,)."""
         p, geometry = self.patches, self.caster.geometry
         sum_area = np.concatenate([[0.0], np.cumsum(p.cell_area)])
         low, high = sum_area[p.start[:-1]], sum_area[p.start[1:]]
@@ -215,7 +290,7 @@ class Transport:
         return out
 
     def source(self, lamp: Lamp) -> Complex64:
-        """Irradiance (len(k), 2P) straight from the light, averaged over points of each side of each patch."""
+        """Compute irradiance (len(k), 2P) straight from the light, averaged over points of each side of each patch."""
         few = max(1, self._rays // 16)
         pick = (np.arange(2 * self.patches.count)[:, None] * self._rays + np.arange(few) * 16).reshape(-1)
         source = direct(self.caster, self._points[pick], self._normals[pick], lamp, self.k)
@@ -223,18 +298,9 @@ class Transport:
         return out
 
     def solve(self, lamp: Lamp, tolerance: float = 1e-4) -> Complex64:
-        """Indirect irradiance phasors of every side of every patch, all bounces.
+        """Compute the indirect irradiance phasors (len(k), 2P) of every side of every patch, 1/m^2.
 
-        Parameters
-        ----------
-        lamp
-            The illuminator.
-        tolerance
-            Bounces are added until one adds less than this share of the whole.
-
-        Returns
-        -------
-        (len(k), 2P) complex64, 1/m^2
+        Bounces are added until one adds less than ``tolerance`` of the whole.
         """
         out = []
         for matrix, h in zip(self.matrices, self.source(lamp), strict=True):
@@ -256,16 +322,14 @@ class Transport:
         rays: int,
         pattern: Int64,
     ) -> Complex64:
-        """Indirect irradiance phasors at points: the last bounce by rays, the ones before from the solution.
+        """Compute indirect irradiance phasors at points: the last bounce by rays, the ones before from the solution.
 
         Parameters
         ----------
         points, normals
             (N, 3), world frame.
-        lamp
-            The illuminator.
-        solution
-            What :meth:`solve` returned for this lamp.
+        lamp, solution
+            The illuminator, and what :meth:`solve` returned for it.
         rays
             Rays per point.
         pattern
@@ -291,7 +355,7 @@ class Transport:
         return total
 
     def _arriving(self, origins: Float32, directions: Float32, lamp: Lamp, solution: Complex64) -> Complex64:
-        """Mean (len(k), N) over rays from origins (N, 3) in directions (N, R, 3) of the light that comes along them."""
+        """Average (len(k), N) over rays from origins (N, 3) in directions (N, R, 3) of the light that comes along them."""
         geometry, shape = self.caster.geometry, directions.shape[:2]
         origins = np.repeat(origins, shape[1], axis=0)
         directions = directions.reshape(-1, 3)

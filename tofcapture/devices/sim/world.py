@@ -6,143 +6,39 @@ the same arrays, whatever was taken before it.
 
 from __future__ import annotations
 
-import hashlib
-import tomllib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tofcapture.camera import Camera
-from tofcapture.devices.sim import sensor as sensors
-from tofcapture.devices.sim import stereo as stereos
+from tofcapture.devices.sim import VERSION, hashed_generator
+from tofcapture.devices.sim.config import TABLES, Constants, load_world, read_constants, refuse_unknown
 from tofcapture.devices.sim.faults import FaultPlan, Faults, read_faults
 from tofcapture.devices.sim.light import Light, exact_view, light_at_pixels
-from tofcapture.devices.sim.render import Caster, merge
-from tofcapture.devices.sim.scene import SceneObject
-from tofcapture.devices.sim.sensor import Sensor, expose
-from tofcapture.devices.sim.stereo import StereoModel, point_map
+from tofcapture.devices.sim.scene import Caster, SceneObject, merge
+from tofcapture.devices.sim.scenes import mesh_files, scene_objects
+from tofcapture.devices.sim.sensor import expose
+from tofcapture.devices.sim.stereo import point_map
 from tofcapture.devices.sim.transport import Lamp, Transport
-from tofcapture.errors import ConfigError, DeviceError
-from tofcapture.frames import StereoFrame, StereoInfo, TofBurst, TofInfo, Truth
+from tofcapture.errors import DeviceError
+from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth, View
 from tofcapture.ops.phase import frequencies
-from tofcapture.poses import Float64, rotation_exp, transform, transform_points
-from tofcapture.rig import RangeError, Rig, range_error_from
+from tofcapture.poses import Float64, invert, rotation_exp, transform, transform_points
+from tofcapture.rig import RangeError, Rig
 
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
 
-_T = TypeVar("_T")
-
-
-@dataclass(frozen=True)
-class Render:
-    """How finely the light is computed; see constants.toml."""
-
-    multipath: bool = True
-    subpixels: int = 4
-    rays: int = 48
-    patches: int = 2500
-    patch_rays: int = 256
-
-
-@dataclass(frozen=True)
-class Constants:
-    """Everything about the simulated devices that is not the scene."""
-
-    tof: Camera
-    illuminator: Float64
-    lamp: Mapping[str, float]
-    sensor: Sensor
-    factory: Mapping[str, float]
-    stereo: Camera
-    stereo_model: StereoModel
-    rig: Mapping[str, Any]
-    render: Render
-
-
-TABLES = ("tof", "lamp", "sensor", "factory", "stereo", "stereo_model", "rig", "render")
-
-
-def default_constants() -> dict[str, Any]:
-    """Tables of constants.toml."""
-    return tomllib.loads(Path(__file__).with_name("constants.toml").read_text(encoding="utf-8"))
-
-
-def merged(overrides: Mapping[str, Any], where: str, table: str) -> dict[str, Any]:
-    """Take one table of constants.toml with overrides laid over it.
-
-    Raises
-    ------
-    ConfigError
-        On a key that constants.toml does not know.
-    """
-    base = dict(default_constants()[table])
-    given = overrides.get(table, {})
-    unknown = set(given) - set(base)
-    if unknown:
-        raise ConfigError(
-            f"{where}: [{table}] does not know {', '.join(sorted(unknown))}",
-            hint=f"it knows {', '.join(sorted(base))}",
-        )
-    return {**base, **given}
-
-
-def _make(kind: Callable[..., _T], values: Mapping[str, Any], where: str) -> _T:
-    try:
-        return kind(**values)
-    except (TypeError, ValueError) as err:
-        raise ConfigError(f"{where}: {err}") from err
-
-
-def read_constants(overrides: Mapping[str, Any], where: str) -> Constants:
-    """Read the simulator's constants: constants.toml with ``overrides`` (tables of the same names) laid over it."""
-    tof = merged(overrides, where, "tof")
-    illuminator = np.asarray(tof.pop("illuminator"), dtype=np.float64)
-    if illuminator.shape != (3,):
-        raise ConfigError(f"{where}: [tof] illuminator: expected 3 numbers, got {illuminator.tolist()}")
-    sensor = merged(overrides, where, "sensor")
-    errors = tuple(range_error_from(e) for e in sensor.pop("range_error"))
-    for key in ("modulation_hz", "phase_rad", "contrast"):
-        sensor[key] = tuple(float(x) for x in sensor[key])
-    sensor["harmonics"] = tuple((int(m), float(a)) for m, a in sensor["harmonics"])
-    made = _make(lambda **v: Sensor(range_errors=errors, **v), sensor, f"{where}: [sensor]")
-    sensors.check_channels(made, f"{where}: [sensor]")
-    return Constants(
-        tof=_make(Camera, tof, f"{where}: [tof]"),
-        illuminator=illuminator,
-        lamp=merged(overrides, where, "lamp"),
-        sensor=made,
-        factory=merged(overrides, where, "factory"),
-        stereo=_make(Camera, merged(overrides, where, "stereo"), f"{where}: [stereo]"),
-        stereo_model=_make(StereoModel, merged(overrides, where, "stereo_model"), f"{where}: [stereo_model]"),
-        rig=merged(overrides, where, "rig"),
-        render=_make(Render, merged(overrides, where, "render"), f"{where}: [render]"),
-    )
-
-
-def idealised(constants: Constants) -> Constants:
-    """Return the same world seen without any sensor imperfection: geometry, albedo and multipath stay."""
-    render = replace(constants.render, rays=max(constants.render.rays, 128))
-    return replace(
-        constants,
-        sensor=sensors.ideal(constants.sensor),
-        stereo_model=stereos.ideal(constants.stereo_model),
-        factory=dict.fromkeys(constants.factory, 0.0),
-        render=render,
-    )
-
 
 def _generator(*parts: object) -> np.random.Generator:
-    digest = hashlib.sha256("|".join(repr(p) for p in parts).encode()).digest()
-    return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32).tolist())
+    return hashed_generator("|".join(repr(p) for p in parts).encode())
 
 
 def factory_calibration(constants: Constants, seed: int) -> tuple[RangeError, ...]:
-    """Range errors as the maker's calibration knows them: the true ones, slightly wrong."""
+    """Make the range errors that the maker's calibration knows: the true ones, slightly wrong."""
     rng = _generator("factory", seed)
     wrong = constants.factory
     out = []
@@ -163,11 +59,6 @@ def factory_calibration(constants: Constants, seed: int) -> tuple[RangeError, ..
     return tuple(out)
 
 
-def _model_name(constants: Constants) -> str:
-    megahertz = "/".join(f"{f / 1e6:g}" for f in frequencies(constants.sensor.modulation_hz))
-    return f"simulated {constants.tof.width}x{constants.tof.height} {megahertz} MHz"
-
-
 class SimWorld:
     """A scene, a pose, and what the devices of one station measure there.
 
@@ -179,10 +70,16 @@ class SimWorld:
         Seeds everything random, the makers' calibrations and the bracket's drawing error included.
     scenes
         ``(name, seed) -> objects`` in the base frame.
+    faults
+        What goes wrong on demand.
     """
 
     def __init__(
-        self, constants: Constants, seed: int, scenes: Callable[[str, int], Sequence[SceneObject]]
+        self,
+        constants: Constants,
+        seed: int,
+        scenes: Callable[[str, int], Sequence[SceneObject]],
+        faults: FaultPlan | None = None,
     ) -> None:
         self.constants = constants
         self.seed = seed
@@ -191,9 +88,10 @@ class SimWorld:
         self._pose: tuple[Float64, bytes] | None = None
         self._built: tuple[str, Caster, Transport | None] | None = None
         self._lit: tuple[object, Light] | None = None
-        self.faults = Faults(FaultPlan())
+        self.faults = Faults(faults or FaultPlan())
+        megahertz = "/".join(f"{f / 1e6:g}" for f in frequencies(constants.sensor.modulation_hz))
         self.tof_info = TofInfo(
-            model=_model_name(constants),
+            model=f"simulated {constants.tof.width}x{constants.tof.height} {megahertz} MHz",
             serial=f"sim-tof-{seed}",
             camera=constants.tof,
             illuminator=constants.illuminator,
@@ -207,7 +105,7 @@ class SimWorld:
 
     @cached_property
     def true_rig(self) -> Rig:
-        """Where the cameras truly are, and the true range errors."""
+        """Say where the cameras truly are, with the true range errors."""
         rig = self.constants.rig
         return Rig(
             tof=self.constants.tof,
@@ -219,7 +117,7 @@ class SimWorld:
         )
 
     def nominal_rig(self) -> Rig:
-        """What the bracket's drawing and the maker's calibration say: the true rig, wrong by degrees and millimetres."""
+        """Say what the bracket's drawing and the maker's calibration say: wrong by degrees and millimetres."""
         rng = _generator("drawing", self.seed)
         shift, tilt = self.constants.rig["drawing_error"], self.constants.rig["drawing_tilt_error"]
 
@@ -238,14 +136,9 @@ class SimWorld:
         self._scene = scene
 
     def set_pose(self, T_base_flange: Float64, key: bytes) -> None:
-        """Tell the world where the flange truly is.
+        """Tell the world where the flange truly is (4, 4).
 
-        Parameters
-        ----------
-        T_base_flange
-            (4, 4).
-        key
-            Names the commanded pose; the noise of a view is drawn from seed, scene and key.
+        ``key`` names the commanded pose; the noise of a view is drawn from seed, scene and key.
         """
         self._pose = (T_base_flange, key)
 
@@ -281,7 +174,7 @@ class SimWorld:
         return self._here()[0] @ T_flange_camera
 
     def light(self) -> Light:
-        """What reaches the ToF pixels at the present pose."""
+        """Compute what reaches the ToF pixels at the present pose."""
         T_base_flange, key = self._here()
         name = (self._scene, key, T_base_flange.tobytes())
         if self._lit is None or self._lit[0] != name:
@@ -328,7 +221,7 @@ class SimWorld:
         return StereoFrame(points=points, time_ns=clock(), info=self.stereo_info)
 
     def truth(self) -> Truth:
-        """What is exactly true of the present view."""
+        """Say what is exactly true of the present view."""
         T_base_tof = self._pose_of(self.true_rig.T_flange_tof)
         depth, normals, target = exact_view(self.caster()[0], self.constants.tof.scaled(2), T_base_tof)
         return Truth(depth, normals, target, self.true_rig.T_tof_stereo, self.true_rig.T_flange_tof)
@@ -337,34 +230,54 @@ class SimWorld:
 def shared_world(context: StationContext) -> SimWorld:
     """Return the world that all simulated drivers of one station share; made by the first that asks.
 
-    The station file's ``[sim]`` table holds ``seed``, optionally ``meshes`` (a folder) with ``mesh_unit``, ``faults`` on demand, and
-    overrides of constants.toml.
+    The station file's ``[sim]`` table holds ``seed``, optionally ``meshes`` (a folder) with ``mesh_unit``, ``faults`` on
+    demand, and overrides of constants.toml.
     """
-    from tofcapture.devices.sim.scenes import scene_objects
-
     if "sim" not in context.shared:
         table = dict(context.config.get("sim", {}))
-        seed = int(table.pop("seed", 0))
-        faults = read_faults(table.pop("faults", {}))
-        meshes, unit = table.pop("meshes", None), str(table.pop("mesh_unit", "m"))
-        unknown = table.keys() - set(TABLES)
-        if unknown:
-            raise ConfigError(
-                f"[sim] does not know {', '.join(sorted(unknown))}",
-                hint=f"it knows seed, meshes, mesh_unit, faults, {TABLES}",
-            )
-        folder = None if meshes is None else context.folder / meshes
-        paths = (
-            {}
-            if folder is None
-            else {p.stem: p for p in sorted(folder.iterdir()) if p.suffix in {".ply", ".obj", ".stl"}}
+        refuse_unknown(table, {"seed", "meshes", "mesh_unit", "faults", *TABLES}, "[sim]")
+        folder, unit = table.get("meshes"), str(table.get("mesh_unit", "m"))
+        paths = {} if folder is None else {p.stem: p for p in mesh_files(context.folder / folder)}
+        world = SimWorld(
+            read_constants(table, "station file"),
+            int(table.get("seed", 0)),
+            lambda name, seed: scene_objects(name, seed, paths, unit),
+            read_faults(table.get("faults", {})),
         )
+        context.shared["sim"], context.shared["rig"] = world, world.nominal_rig()
+    found: SimWorld = context.shared["sim"]
+    return found
 
-        def scenes(name: str, scene_seed: int) -> Sequence[SceneObject]:
-            return scene_objects(name, scene_seed, paths, unit)
 
-        made = SimWorld(read_constants(table, "station file"), seed, scenes)
-        made.faults = Faults(faults)
-        context.shared["sim"] = made
-    world: SimWorld = context.shared["sim"]
-    return world
+def simulate(path: Path, *, ideal: bool, frames: int) -> View:
+    """Render one view of a world file.
+
+    Parameters
+    ----------
+    path
+        The world file.
+    ideal
+        Switch every sensor imperfection and quantisation off; raw is float64 then.
+    frames
+        Frames in the burst.
+    """
+    file = load_world(path)
+    constants = file.constants.idealised() if ideal else file.constants
+    world = SimWorld(constants, file.seed, lambda _name, _seed: file.objects)
+    T_world_flange = file.T_world_tof @ invert(world.true_rig.T_flange_tof)
+    world.place(path.stem)
+    world.set_pose(T_world_flange, b"world file")
+    clock = iter(range(0, 10**13, 10**9)).__next__
+    arm = ArmState(np.full(6, np.nan), T_world_flange, 0)
+    provenance = {"made_by": "tofcapture simulate", "simulator": VERSION, "world": path.name}
+    return View(
+        scene=path.stem,
+        index=0,
+        tof=world.tof(frames, clock),
+        stereo=world.stereo(clock),
+        arm_before=arm,
+        arm_after=arm,
+        rig=world.true_rig if ideal else world.nominal_rig(),
+        provenance={**provenance, "ideal": ideal, "seed": file.seed},
+        truth=world.truth(),
+    )
