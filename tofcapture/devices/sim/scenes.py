@@ -40,7 +40,8 @@ _REACH = 0.33  # m; targets stay within this disc about the table's centre
 
 def on_table(x: float, y: float) -> Float64:
     """Point (3,) at the table top, from its centre, metres."""
-    return TABLE_CENTRE + np.array([x, y, 0.0])
+    out: Float64 = TABLE_CENTRE + np.array([x, y, 0.0])
+    return out
 
 
 def generator(name: str, seed: int, purpose: str) -> np.random.Generator:
