@@ -27,8 +27,8 @@ METADATA: dict[str, dict[str, None]] = {
 }
 """What matplotlib would write of the day and of itself, by format."""
 
-LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-TOF, STEREO, FLANGE = "#e69f00", "#0072b2", "#8a8a8a"
+LINES = ("#2b85c2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+TOF, STEREO, FLANGE = "#e69f00", "#2b85c2", "#8a8a8a"
 _INK = "#010203"  # becomes the page's own text colour
 _DOTS = 700  # of a scatter plot; medians use every point
 _SIZE = (5.6, 2.5)  # inches
@@ -95,9 +95,9 @@ def chart(
         figure.set_size_inches(size)
         figure.set_layout_engine("constrained")
         on = figure.add_subplot(**axes)
-        draw(on)
         on.set_xlabel(x)
         on.set_ylabel(y)
+        draw(on)
         return inline(figure, words)
 
 

@@ -1,4 +1,4 @@
-"""``tofcapture report``: one HTML file that shows what was captured, how it was aligned, and what the network makes of it.
+"""Write one HTML file that shows what was captured, how it was aligned, and what the network makes of it.
 
 No script, no address of another file: pictures are inside, lengths are millimetres. Same inputs, same bytes.
 """
@@ -9,7 +9,6 @@ import argparse
 from pathlib import Path
 
 from tofcapture.command import Outcome
-from tofcapture.files.seal import write_text
 
 VIEWS = 3  # example views: what fits into a few megabytes
 
@@ -51,11 +50,12 @@ def write_report(
     DataError, FormatError
         A part that is given is damaged or foreign.
     """
-    from tofcapture_model.report.page import read_sources, render_page
+    from tofcapture.viz.page import write_page
+    from tofcapture_model.report.content import content
+    from tofcapture_model.report.sources import read_sources
 
-    page = render_page(read_sources(dataset, results, evidence, weights), views)
-    write_text(Path(out), page)
-    return Path(out)
+    sources = read_sources(dataset, results, evidence, weights)
+    return write_page(Path(__file__).with_name("report.html.j2"), Path(out), content(sources, views))
 
 
 def run(args: argparse.Namespace) -> Outcome:

@@ -1,55 +1,29 @@
-"""Example views as groups of pictures with common scales."""
+"""Draw example views as groups of pictures with common scales."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from tofcapture.files.layout import MaskBit
+from tofcapture.colours import NORMAL_WORDS, Scale, percentile, scale_for
 from tofcapture.poses import Float64
-from tofcapture_model.evaluation.metrics import angles_deg
-from tofcapture_model.report.clouds import SIZE, render, shaded_palette, side_view
-from tofcapture_model.report.examples import Answer, Example
-from tofcapture_model.report.pictures import (
-    Picture,
-    Scale,
-    UInt8,
-    indexed_picture,
-    normal_picture,
-    scalar_picture,
-)
+from tofcapture.viz.figures.clouds import eye_for, splat
+from tofcapture.viz.figures.scenes import halved, object_window
+from tofcapture.viz.page import Picture, map_picture, mask_legend, mask_picture, normal_picture, picture
+from tofcapture_model.report.examples import Example
 
 METHOD_TITLES = {"sensor": "ToF sensor", "model": "network"}
-ERROR_COLOURS = "RdBu_r"
-_NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # mm, ends of error scales
 _MARGIN = 1.25  # of the object's radius: what of its surroundings a point cloud shows
-
-GOOD_COLOUR = (0, 158, 115)
-MASK_COLOURS = {
-    MaskBit.NOT_HIT: (20, 20, 20),
-    MaskBit.OCCLUDED: (213, 94, 0),
-    MaskBit.GRAZING: (240, 228, 66),
-    MaskBit.EDGE: (86, 180, 233),
-    MaskBit.OUTSIDE: (170, 170, 170),
-}
-"""Okabe and Ito's colours; a pixel with several bits has the colour of the first."""
-
-MASK_WORDS = {
-    MaskBit.NOT_HIT: "not hit: no measured surface on this ray",
-    MaskBit.OCCLUDED: "occluded for the stereo camera",
-    MaskBit.GRAZING: "seen at more than 75 degrees",
-    MaskBit.EDGE: "at a depth edge",
-    MaskBit.OUTSIDE: "outside the object crop",
-}
+_WIDTH, _GROUND = 480, 28  # pixels of a cloud's picture; its grey
 
 
 @dataclass(frozen=True)
 class Group:
-    """Pictures side by side, with the scales they share."""
+    """Pictures side by side, with the scales they share as (words, scale)."""
 
     title: str
     note: str
@@ -66,208 +40,113 @@ class Panel:
     legend: list[tuple[str, str, str]]
 
 
-def nice_limit(values_mm: NDArray[np.floating], percentile: float) -> float:
-    """Smallest round number of millimetres that covers a percentile of absolute values; 10 without values."""
-    finite = np.abs(values_mm[np.isfinite(values_mm)])
-    if finite.size == 0:
-        return 10.0
-    wanted = np.percentile(finite, percentile)
-    return float(next((n for n in _NICE if n >= wanted), _NICE[-1]))
-
-
 def panels(examples: Sequence[Example]) -> list[Panel]:
     """Draw all examples; errors of all of them are on one scale."""
-    errors = [1e3 * e.depth_error(e.sensor, e.good).ravel() for e in examples]
-    limit = nice_limit(np.concatenate([*errors, np.zeros(0)]), 90)
-    return [_panel(example, limit) for example in examples]
-
-
-def _panel(example: Example, limit: float) -> Panel:
-    error = Scale(ERROR_COLOURS, -limit, limit, "mm")
-    groups = [
-        _seen(example),
-        _depths(example),
-        _errors(example, error),
-        _normals(example),
-        _clouds(example, limit),
+    error = scale_for("error", [e.answers["sensor"].error_mm for e in examples])
+    return [
+        Panel(
+            e.name,
+            [_seen(e), _depths(e), _errors(e, error), _normals(e), _clouds(e, error)],
+            mask_legend(e.truth.mask),
+        )
+        for e in examples
     ]
-    return Panel(f"{example.scene}, view {example.index}", groups, mask_legend(example.ground_truth.mask))
 
 
-def _seen(example: Example) -> Group:
-    amplitude = Scale("gray", 0, _top(example.amplitude), "raw units at the lowest frequency", 2)
-    confidence = Scale("cividis", 0, _top(example.confidence), "raw units at the highest frequency", 2)
+def _seen(e: Example) -> Group:
+    amplitude, confidence = (scale_for("amplitude", [image]) for image in (e.amplitude, e.confidence))
+    title, note = "ground-truth mask", "frame: what is shown below"
     pictures = [
-        scalar_picture(
-            "amplitude, one frame", example.amplitude, amplitude, "amplitude image of the ToF camera"
-        ),
-        scalar_picture(
-            "confidence, burst", example.confidence, confidence, "confidence map of the ToF camera"
-        ),
-        mask_picture(example.ground_truth.mask, example.window),
+        map_picture("amplitude, one frame", e.amplitude, amplitude, "amplitude image of the ToF camera"),
+        map_picture("confidence, burst", e.confidence, confidence, "confidence map of the ToF camera"),
+        mask_picture(title, e.truth.mask, "mask of the ground truth", note, object_window(e.good)),
     ]
-    scales = [("amplitude", amplitude), ("confidence", confidence)]
+    scales = [("amplitude, lowest frequency", amplitude), ("confidence, highest frequency", confidence)]
     return Group("What the ToF camera saw, and where ground truth is sound", "", pictures, scales)
 
 
-def _framed(indices: UInt8, window: tuple[slice, slice], colour: int) -> UInt8:
-    """Draw the rim of a window, two pixels wide."""
-    inside = np.zeros(indices.shape, bool)
-    inside[window] = True
-    rows, columns = window
-    inside[rows.start + 2 : rows.stop - 2, columns.start + 2 : columns.stop - 2] = False
-    return np.where(inside, np.uint8(colour), indices)
-
-
-def _top(image: NDArray[np.floating]) -> float:
-    """Upper end of a scale: bright spots may clip."""
-    finite = image[np.isfinite(image)]
-    return max(float(np.percentile(finite, 99.5)) if finite.size else 0.0, 1.0)
-
-
-def mask_indices(mask: UInt8) -> UInt8:
-    """0 for good pixels, otherwise 1 + the position of the first bit that is set."""
-    out = np.zeros(mask.shape, np.uint8)
-    for i, bit in reversed(list(enumerate(MASK_COLOURS, start=1))):
-        out[(mask & bit) > 0] = i
-    return out
-
-
-def mask_picture(mask: UInt8, window: tuple[slice, slice]) -> Picture:
-    """Picture of the mask's bits, with the window that the other pictures show."""
-    colours = np.full((256, 3), 255, np.uint8)
-    colours[: 1 + len(MASK_COLOURS)] = [GOOD_COLOUR, *MASK_COLOURS.values()]
-    indices = _framed(mask_indices(mask), window, colour=255)
-    return indexed_picture(
-        "ground-truth mask", indices, colours, "mask of the ground truth", "frame: what is shown below"
-    )
-
-
-def mask_legend(mask: UInt8) -> list[tuple[str, str, str]]:
-    """(CSS colour, words, share of the pixels) of every colour of the mask."""
-    shares = np.bincount(mask_indices(mask).ravel(), minlength=1 + len(MASK_COLOURS)) / max(mask.size, 1)
-    words = ["0: good, metrics are taken here", *(f"{int(bit)}: {MASK_WORDS[bit]}" for bit in MASK_COLOURS)]
-    colours = [f"rgb{c}" for c in (GOOD_COLOUR, *MASK_COLOURS.values())]
-    return [
-        (c, w, f"{100 * s:.1f}\N{NO-BREAK SPACE}%") for c, w, s in zip(colours, words, shares, strict=True)
-    ]
-
-
-def _depths(example: Example) -> Group:
-    truth, half = example.ground_truth.depth[example.window], _halved(example.window)
-    known = truth[np.isfinite(truth)]
-    known = known if known.size else example.sensor.depth.ravel()
-    low, high = (1e3 * float(x) for x in np.percentile(known, [0.5, 99.5]))
-    scale = Scale("viridis", np.floor(low / 10) * 10, np.ceil(high / 10) * 10, "mm")
+def _depths(e: Example) -> Group:
+    window = object_window(e.good)
+    scale = scale_for("depth", [1e3 * e.truth.depth], [e.good], "mm")
     pictures = [
-        scalar_picture(
-            "ToF depth, one frame", 1e3 * example.tof_depth[half], scale, "depth of the ToF sensor"
+        map_picture(
+            "ToF depth, one frame", 1e3 * e.tof_depth[halved(window)], scale, "depth of the ToF sensor"
         )
     ]
-    if example.model:
-        depth = 1e3 * example.model.depth[example.window]
-        pictures.append(scalar_picture("depth, network, same frame", depth, scale, "depth of the network"))
-    pictures.append(scalar_picture("depth, ground truth", 1e3 * truth, scale, "depth of the ground truth"))
+    if "model" in e.answers:
+        depth = 1e3 * e.answers["model"].depth[window]
+        pictures.append(map_picture("depth, network, same frame", depth, scale, "depth of the network"))
+    truth = 1e3 * e.truth.depth[window]
+    pictures.append(map_picture("depth, ground truth", truth, scale, "depth of the ground truth"))
     return Group("Depth", "Grey: no value.", pictures, [("depth", scale)])
 
 
-def _halved(window: tuple[slice, slice]) -> tuple[slice, slice]:
-    """Return the same window on the sensor's own grid."""
-    rows, columns = (slice(s.start // 2, (s.stop + 1) // 2) for s in window)
-    return rows, columns
-
-
-def _errors(example: Example, scale: Scale) -> Group:
-    pictures, scales = [], [("answer minus ground truth", scale)]
-    for name, answer in example.answers.items():
-        values = 1e3 * example.depth_error(answer, example.surface)[example.window]
-        mean = 1e3 * _mean(np.abs(example.depth_error(answer, example.good)))
-        title = f"error, {METHOD_TITLES[name]}"
-        note = f"MAE {mean:.1f} mm on the object" if np.isfinite(mean) else "no good pixel"
+def _errors(e: Example, scale: Scale) -> Group:
+    window, pictures, scales = object_window(e.good), [], [("answer minus ground truth", scale)]
+    for name, maps in e.answers.items():
+        method = METHOD_TITLES[name]
+        shown = np.where(e.surface, maps.error_everywhere_mm, np.nan)[window]
+        note = _mean("MAE {:.1f} mm on the object", np.abs(maps.error_mm))
         pictures.append(
-            scalar_picture(title, values, scale, f"signed depth error of the {METHOD_TITLES[name]}", note)
+            map_picture(f"error, {method}", shown, scale, f"signed depth error of the {method}", note)
         )
-    if example.model and example.model.expected_error is not None:
-        values = 1e3 * example.model.expected_error[example.window]
-        expected = Scale("magma", 0, nice_limit(values, 99), "mm")
-        note = f"mean {1e3 * _mean(example.model.expected_error[example.good]):.1f} mm on the object"
-        pictures.append(
-            scalar_picture("error that the network expects", values, expected, "expected error", note)
-        )
+    if e.expected_error is not None:
+        values = 1e3 * e.expected_error
+        expected = scale_for("expected", [values[window]])
+        note = _mean("mean {:.1f} mm on the object", values[e.good])
+        title = "error that the network expects"
+        pictures.append(map_picture(title, values[window], expected, "expected error", note))
         scales.append(("expected absolute error", expected))
-    return Group(
-        "Depth error", "Red: too far, blue: too near, grey: no sound ground truth.", pictures, scales
-    )
+    words = "Red: too far, blue: too near, grey: no sound ground truth."
+    return Group("Depth error", words, pictures, scales)
 
 
-def _mean(values: NDArray[np.floating]) -> float:
+def _mean(form: str, values: NDArray[np.floating]) -> str:
     finite = values[np.isfinite(values)].astype(np.float64)
-    return float(finite.mean()) if finite.size else float("nan")
+    return form.format(finite.mean()) if finite.size else "no good pixel"
 
 
-def mean_angle_deg(example: Example, answer: Answer) -> float:
-    """Mean angle to the ground truth's normals over the good pixels, degrees; NaN without any."""
-    known = example.good & np.isfinite(example.ground_truth.normals).all(axis=-1)
-    pair = (
-        torch.from_numpy(np.ascontiguousarray(n[known].T))
-        for n in (answer.normals, example.ground_truth.normals)
-    )
-    return float(angles_deg(*pair).mean()) if known.any() else float("nan")
-
-
-def _normals(example: Example) -> Group:
-    pictures = []
-    for name, answer in example.answers.items():
-        angle = mean_angle_deg(example, answer)
-        note = f"mean angle {angle:.1f} degrees on the object" if np.isfinite(angle) else "no good pixel"
-        title = f"normals, {METHOD_TITLES[name]}"
-        pictures.append(
-            normal_picture(
-                title, answer.normals[example.window], f"normals of the {METHOD_TITLES[name]}", note
-            )
-        )
-    truth = example.ground_truth.normals[example.window]
+def _normals(e: Example) -> Group:
+    window, pictures = object_window(e.good), []
+    for name, maps in e.answers.items():
+        note = _mean("mean angle {:.1f} degrees on the object", maps.angle_deg)
+        method = METHOD_TITLES[name]
+        title, alt = f"normals, {method}", f"normals of the {method}"
+        pictures.append(normal_picture(title, maps.normals[window], alt, note))
+    truth = e.truth.normals[window]
     pictures.append(normal_picture("normals, ground truth", truth, "normals of the ground truth"))
-    return Group("Normals", "Redder to the right, greener upwards, bluer towards the camera.", pictures, [])
+    return Group("Normals", f"{NORMAL_WORDS.capitalize()}.", pictures, [])
 
 
-def _clouds(example: Example, limit: float) -> Group:
-    """Sensor, network and ground truth from the side: the object and what is near it."""
-    truth = example.camera.unproject(example.ground_truth.depth)
-    object_points = truth[example.good]
-    if len(object_points) == 0:
-        return Group("Points from the side", "No good pixel in this view.", [], [])
-    centre = np.median(object_points, axis=0)
-    radius = _MARGIN * float(np.percentile(np.linalg.norm(object_points - centre, axis=1), 99))
-    colours, pictures = shaded_palette(ERROR_COLOURS), []
-    for name, answer in {**example.answers, "truth": None}.items():
-        depth = example.ground_truth.depth if answer is None else answer.depth
-        normals = example.ground_truth.normals if answer is None else answer.normals
-        error = (
-            np.zeros(depth.shape) if answer is None else 1e3 * example.depth_error(answer, example.surface)
+def _clouds(e: Example, scale: Scale) -> Group:
+    """Draw sensor, network and ground truth from the side: the object and what is near it."""
+    title, truth = "Points from the side", e.camera.unproject(e.truth.depth)
+    if not e.good.any():
+        return Group(title, "No good pixel in this view.", [], [])
+    centre = np.median(truth[e.good], axis=0)
+    radius = _MARGIN * percentile([np.linalg.norm(truth[e.good] - centre, axis=1)], 99, 0.0)
+    drawn: list[tuple[str, Float64, NDArray[Any]]] = [
+        (
+            METHOD_TITLES[name],
+            e.camera.unproject(maps.depth),
+            np.where(e.surface, maps.error_everywhere_mm, np.nan),
         )
-        points = truth if answer is None else example.camera.unproject(depth)
-        indices = _cloud(example, points, normals, 0.5 + error / (2 * limit), centre, radius)
-        title = "ground truth" if answer is None else METHOD_TITLES[name]
-        pictures.append(
-            indexed_picture(f"points, {title}", indices, colours, f"points of the {title} from the side")
-        )
+        for name, maps in e.answers.items()
+    ]
+    drawn.append(("ground truth", truth, np.zeros(e.truth.depth.shape)))
+    eye = eye_for(truth[_near(truth, centre, radius)], e.T_base_tof, e.camera.width / e.camera.height)
+    spacing = float(centre[2]) / e.camera.fx / float(eye.high[0] - eye.low[0]) * _WIDTH
+    size = int(np.clip(np.ceil(1.4 * spacing) + 1, 2, 7))
+    pictures = []
+    for name, points, error in drawn:
+        near = _near(points, centre, radius)
+        image = splat([(points[near], scale.paint(error)[near])], eye, _WIDTH, size, _GROUND)
+        pictures.append(picture(f"points, {name}", image, f"points of the {name} from the side"))
     note = "All points near the object, from the side and above; colours of the error maps, grey without ground truth."
-    return Group("Points from the side", note, pictures, [])
+    return Group(title, note, pictures, [])
 
 
-def _cloud(
-    example: Example,
-    points: Float64,
-    normals: NDArray[np.floating],
-    values: NDArray[np.floating],
-    centre: Float64,
-    radius: float,
-) -> UInt8:
+def _near(points: Float64, centre: Float64, radius: float) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):
-        near = np.linalg.norm(points - centre, axis=-1) < radius
-    metres_per_pixel = 2.3 * radius / SIZE[1]
-    spacing = float(np.median(points[near][:, 2])) / example.camera.fx if near.any() else 0.0
-    dot = int(np.clip(np.ceil(1.4 * spacing / metres_per_pixel) + 1, 2, 7))
-    eye = side_view(example.T_base_tof, centre)
-    return render(points[near], normals[near], values[near], eye, metres_per_pixel, dot)
+        out: NDArray[np.bool_] = np.linalg.norm(points - centre, axis=-1) < radius
+    return out

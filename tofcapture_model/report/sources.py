@@ -1,0 +1,174 @@
+"""Read what the report is made from; what is not there is told, and what does not belong together is doubted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tofcapture.errors import ConfigError, DataError, FormatError
+from tofcapture.files.manifest import Manifest, load_manifest, manifest_path
+from tofcapture.files.seal import sha256_of
+from tofcapture_model.config import Config
+from tofcapture_model.networks.zoo import Model
+from tofcapture_model.training.checkpoint import find_model, load_model
+from tofcapture_model.training.learned import origin, sentence
+from tofcapture_model.training.runlog import read_metrics
+
+
+@dataclass(frozen=True)
+class Network:
+    """A loaded network and what its checkpoint says.
+
+    Attributes
+    ----------
+    model, config, provenance
+        From :func:`tofcapture_model.training.checkpoint.load_model`.
+    name, sha256
+        Of the file.
+    rows
+        Lines of ``metrics.jsonl``; empty where there is none.
+    bundled
+        Whether it came with the installation.
+    """
+
+    model: Model
+    config: Config
+    provenance: Mapping[str, Any]
+    name: str
+    sha256: str
+    rows: list[dict[str, Any]]
+    bundled: bool = False
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What the page is made from; a part that is None is reported as absent for the reason given.
+
+    Attributes
+    ----------
+    dataset
+        Folder, or None.
+    manifest, manifest_sha256
+        Of the dataset.
+    results, evidence
+        Parsed JSON.
+    network
+        With its weights.
+    absent
+        Reason by part: ``dataset``, ``results``, ``evidence``, ``weights``.
+    """
+
+    dataset: Path | None
+    manifest: Manifest | None
+    manifest_sha256: str
+    results: Mapping[str, Any] | None
+    evidence: Mapping[str, Any] | None
+    network: Network | None
+    absent: Mapping[str, str]
+
+    @property
+    def split(self) -> str:
+        """Split that the results were measured on; ``test`` without results."""
+        return str(self.results["split"]) if self.results else "test"
+
+
+def read_sources(
+    dataset: Path | None, results: Path | None, evidence: Path | None, weights: Path | None
+) -> Sources:
+    """Read all parts; at least a dataset or results must be there.
+
+    Raises
+    ------
+    ConfigError
+        Neither is given.
+    DataError, FormatError
+        A part that is given is damaged or foreign, or the dataset is missing.
+    """
+    if dataset is None and results is None:
+        raise ConfigError("nothing to report", hint="--dataset DIR --results results.json")
+    if results is not None and not Path(results).is_file():
+        raise DataError(f"{results}: no such file", hint="tofcapture evaluate DATASET --out results.json")
+    scores, no_results = _read_json(results, "tofcapture-results", ("methods", "split"), "--results")
+    keys = ("pairs", "used", "views", "backend", "T_tof_stereo")
+    proof, no_evidence = _read_json(evidence, "tofcapture-evidence", keys, "--evidence")
+    network, no_weights = _read_network(weights)
+    absent = {
+        "dataset": "" if dataset else "not given, name it with --dataset",
+        "results": no_results,
+        "evidence": no_evidence,
+        "weights": no_weights,
+    }
+    if dataset is None:
+        return Sources(None, None, "", scores, proof, network, absent)
+    digest = sha256_of(manifest_path(dataset))
+    return Sources(dataset, load_manifest(dataset), digest, scores, proof, network, absent)
+
+
+def _read_json(
+    path: Path | None, kind: str, keys: tuple[str, ...], option: str
+) -> tuple[dict[str, Any] | None, str]:
+    """Read one of the project's JSON files; None and a reason where there is none."""
+    if path is None:
+        return None, f"not given, name it with {option}"
+    if not Path(path).is_file():
+        return None, f"there is no file {path}"
+    try:
+        table = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as err:
+        raise FormatError(f"{path}: not JSON: {err}") from err
+    if not isinstance(table, dict) or (table.get("format"), table.get("version")) != (kind, 1):
+        raise FormatError(f"{path}: expected {kind} version 1")
+    missing = [k for k in keys if k not in table]
+    if missing:
+        raise FormatError(f"{path}: missing {', '.join(missing)}")
+    return table, ""
+
+
+def _read_network(weights: Path | None) -> tuple[Network | None, str]:
+    """Load a network; None and a reason where there is none."""
+    try:
+        path = find_model(weights)
+    except ConfigError as err:
+        return None, f"{err.message}; {err.hint}"
+    if not path.is_file():
+        return None, f"there is no checkpoint at {path}"
+    rows = read_metrics(path.parent / "metrics.jsonl")
+    return Network(*load_model(path), path.name, sha256_of(path), rows, weights is None), ""
+
+
+def doubts(sources: Sources) -> list[str]:
+    """Tell what a reader must know before believing that the parts of the page belong together."""
+    out = []
+    results, network = sources.results, sources.network
+    runs = {} if results is None else dict(results.get("runs", {"The network": results}))
+    trainings = [run.get("training") for run in runs.values()]
+    if results and network and None not in trainings and origin(network.provenance) not in trainings:
+        out.append("The pictures are made with other weights than the table.")
+    trained_on = network.provenance.get("manifest_sha256") if network else None
+    if trained_on and sources.manifest_sha256 and trained_on != sources.manifest_sha256:
+        out.append(
+            "The network is the bundled one: it was trained on other, simulated scenes."
+            if network and network.bundled
+            else "The network was trained on another dataset, or on another state of this one."
+        )
+    if results and sources.manifest and "scenes" in results:
+        scenes, some = set(sources.manifest.split(sources.split)), set(results["scenes"])
+        if some < scenes:
+            out.append(
+                f"The table was measured on {len(some)} of the {len(scenes)} scenes of this dataset's split."
+            )
+        elif some != scenes:
+            out.append("The table was measured on other scenes than this dataset's split holds.")
+    for who, run in runs.items():
+        if "not_new" in run and (
+            said := sentence(who, run["not_new"], len(results["scenes"]) if results else 0)
+        ):
+            out.append(f"{said}.")
+        elif "not_new" not in run and sources.split == "train":
+            out.append(
+                "The table may have been measured on what the network was trained on: the split train."
+            )
+    return out
