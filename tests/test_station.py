@@ -3,13 +3,15 @@
 import io
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 
 from tofcapture.devices import registry, station
 from tofcapture.devices.console import ConsoleOperator
 from tofcapture.devices.registry import StationContext, load_driver, make_device
 from tofcapture.devices.station import open_station, read_station
-from tofcapture.errors import ConfigError, DeviceError
+from tofcapture.errors import ConfigError, DeviceError, MotionRefused
+from tofcapture.frames import ArmInfo, ArmState
 
 
 @dataclass
@@ -41,8 +43,20 @@ class _Device:
     def __exit__(self, *_):
         self.log.append(f"close {self.role}")
 
+    simulated = False
+
     def stop(self):
         self.log.append(f"stop {self.role}")
+
+    def describe(self):
+        return ArmInfo("ur10e", "1")
+
+    def state(self):
+        return ArmState(np.zeros(6), np.eye(4), 1)
+
+    def move_to(self, joints):
+        self.log.append("move")
+        return self.state()
 
 
 @pytest.fixture
@@ -52,6 +66,12 @@ def fake(monkeypatch, tmp_path):
     drivers = {
         role: lambda table, context, role=role: _Device(role, log, role in broken) for role in registry.ROLES
     }
+
+    def arm(table, context):
+        log.append(f"consent {context.allow_motion}")
+        return _Device("arm", log, "arm" in broken)
+
+    drivers["arm"] = arm
     monkeypatch.setattr(
         registry,
         "entry_points",
@@ -70,7 +90,7 @@ def test_opens_and_closes_in_reverse(fake):
     file, log, _ = fake
     with open_station(file) as opened:
         assert opened.rig == "rig.toml"
-        assert log == [f"open {role}" for role in registry.ROLES]
+        assert [entry for entry in log if "open" in entry] == [f"open {role}" for role in registry.ROLES]
         log.clear()
     assert log == [f"close {role}" for role in reversed(registry.ROLES)]
 
@@ -80,9 +100,42 @@ def test_error_stops_the_arm_first(fake):
     file, log, _ = fake
     with pytest.raises(KeyboardInterrupt), open_station(file):
         raise KeyboardInterrupt
-    log = log[len(registry.ROLES) :]
+    log = log[len(registry.ROLES) + 1 :]
     assert log[0] == "stop arm"
     assert log[1:] == [f"close {role}" for role in reversed(registry.ROLES)]
+
+
+def test_a_real_arm_moves_only_when_allowed(fake, monkeypatch):
+    """Without ``allow_motion``, which is the default, a real arm is read and stopped but never moved; a simulated one moves."""
+    file, log, _ = fake
+    with open_station(file) as opened:
+        assert not opened.simulated
+        assert opened.arm.state().joints.shape == (6,)
+        assert opened.arm.describe().serial == "1"
+        with pytest.raises(MotionRefused, match="real and motion was not allowed") as caught:
+            opened.arm.move_to(np.zeros(6))
+        assert "--allow-motion" in caught.value.hint
+        opened.arm.stop()
+    assert "move" not in log
+    assert "stop arm" in log
+    with open_station(file, allow_motion=True) as opened:
+        opened.arm.move_to(np.zeros(6))
+    assert log.count("move") == 1
+    monkeypatch.setattr(_Device, "simulated", True)
+    with open_station(file) as opened:
+        assert opened.simulated
+        opened.arm.move_to(np.zeros(6))
+    assert log.count("move") == 2
+    assert not StationContext({}, file.parent).allow_motion
+
+
+def test_drivers_hear_whether_motion_is_allowed(fake):
+    """The consent of a run reaches every driver of the station, and is no by default."""
+    file, log, _ = fake
+    for allowed in ({}, {"allow_motion": False}, {"allow_motion": True}):
+        with open_station(file, **allowed):
+            pass
+    assert [entry for entry in log if "consent" in entry] == ["consent False"] * 2 + ["consent True"]
 
 
 def test_all_failures_at_once(fake):
@@ -94,7 +147,7 @@ def test_all_failures_at_once(fake):
     assert "tof is unplugged" in caught.value.message
     assert "operator is unplugged" in caught.value.message
     assert "plug the tof in; plug the operator in" in caught.value.hint
-    assert log == ["open arm", "open stereo", "close stereo", "close arm"]
+    assert log[1:] == ["open arm", "open stereo", "close stereo", "close arm"]
 
 
 def test_missing_rig_is_refused(fake):
