@@ -24,7 +24,7 @@ from typing import Any
 
 import aiohttp
 
-from tofcapture.devices.replay_station import write_station
+from tofcapture.devices.replay import write_station
 from tofcapture.record.daemon.client import ask
 
 STATION = Path(__file__).with_name("daemon_station.py")

@@ -20,7 +20,9 @@ import time
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
+
+from tofcapture.devices import Arm
 
 SMALL_STATION = """
 [arm]
@@ -85,6 +87,8 @@ class _Arrays:
 
 class _Role:
     simulated = True
+    person = "BENCH_ASKS" in os.environ
+    can_turn = False
 
     def __init__(self, bench: _Arrays, role: str) -> None:
         self.bench, self.role = bench, role
@@ -147,8 +151,6 @@ def _open_arrays(path: Path | None = None, seed: int | None = None, allow_motion
     del path, allow_motion
     config, bench = read_station(None, seed), _Arrays()
     _Role.simulated = "BENCH_REAL" not in os.environ
-    if "BENCH_ASKS" in os.environ:
-        config["operator"] = {"driver": "console"}
     places = transform(np.eye(3), [-0.05, 0.08, 0.0]), transform(np.eye(3), [0.0, -0.035, 0.08])
     station = Station(
         *(_Role(bench, role) for role in ("arm", "tof", "stereo", "operator")),
@@ -162,19 +164,13 @@ def _open_arrays(path: Path | None = None, seed: int | None = None, allow_motion
         raise
 
 
-class HostArm:
+class HostArm(Arm):
     """An arm in a process of its own, that only takes its time."""
 
     simulated = True
 
     def __init__(self, table: object, context: object) -> None:
         del table, context
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
 
     def describe(self) -> Any:
         """Say what it is."""
@@ -213,15 +209,15 @@ def _with_host(open_real: Callable[..., Any]) -> Callable[..., Any]:
     """Put the arm of a station into a driver host."""
     from dataclasses import replace
 
-    from tofcapture.devices.host import HostedArm
+    from tofcapture.devices.host import hosted
     from tofcapture.devices.registry import StationContext
 
     @contextmanager
     def opened(path: Path | None = None, seed: int | None = None, *, allow_motion: bool = False) -> Any:
         with open_real(path, seed, allow_motion=allow_motion) as station:
             context = StationContext(config=station.config, folder=Path())
-            with HostedArm("arm", "daemon_station:HostArm", {}, context, {}) as hosted:
-                yield replace(station, arm=_Followed(hosted, station.arm))
+            with hosted("arm", "daemon_station:HostArm")({}, context) as arm:
+                yield replace(station, arm=_Followed(arm, station.arm))
 
     return opened
 

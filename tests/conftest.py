@@ -14,7 +14,7 @@ import pytest  # noqa: E402
 @pytest.fixture(scope="module")
 def running():
     """One emulated UR controller for a file of tests."""
-    from tofcapture.testing.ur_emulator.process import Emulator
+    from tests.ur_emulator.process import Emulator
 
     with Emulator() as emulator:
         yield emulator

@@ -3,15 +3,52 @@
 import numpy as np
 
 from tofcapture.devices.kinematics import HOME
-from tofcapture.testing.stations import ur_station
 
 THERE = HOME - [1.2, 0, 0, 0, 0, 0]
+# A UR arm, fast and hardly settling, and simulated cameras of few pixels that follow it.
+STATION = """
+[arm]
+driver = "ur_rtde"
+host = "{host}"
+speed = 1.0
+acceleration = 1.4
+settle = 0.05
+{more}
+[tof]
+driver = "sim"
+[stereo]
+driver = "sim"
+[operator]
+driver = "sim"
+[sim.render]
+multipath = false
+subpixels = 1
+[sim.tof]
+width = 24
+height = 18
+fx = 19.0
+fy = 20.0
+cx = 11.7
+cy = 10.1
+[sim.stereo]
+width = 64
+height = 50
+fx = 60.0
+fy = 60.0
+cx = 31.5
+cy = 24.5
+[plan]
+table = -0.50
+target = [0.70, 0.0, -0.44]
+board = [0.70, 0.0, -0.22]
+board_normal = [-0.258819, 0.0, 0.965926]
+"""
 
 
 def station_file(tmp_path, emulator, more=""):
-    """``station.toml`` of small simulated cameras on the emulated arm."""
+    """``station.toml`` of small simulated cameras on the emulated arm; ``more`` lines go into ``[arm]``."""
     file = tmp_path / "station.toml"
-    file.write_text(ur_station(emulator.host, more))
+    file.write_text(STATION.format(host=emulator.host, more=more))
     return file
 
 

@@ -145,8 +145,11 @@ def test_broken_stations(tmp_path):
     assert found["tof"].verdict == "FAIL"
     assert found["arm"].verdict == found["stereo"].verdict == "PASS"
     assert "devices" not in found
-    port = doctor_station._ask_serial("tof", "driver tof_serial", {"port": str(tmp_path / "ttyUSB0")})
-    assert (port.verdict, "plug it in" in port.advice) == ("FAIL", True)
+    file.write_text(
+        file.read_text().replace('driver = "moon"', f'driver = "tof_serial"\nport = "{tmp_path}/ttyUSB0"')
+    )
+    (port,) = [f for f in doctor_station.look_at_station(str(file)) if (f.what, f.verdict) == ("tof", "FAIL")]
+    assert "plug it in" in port.advice
 
 
 def test_a_station_of_real_devices_before_its_first_day(tmp_path):
@@ -167,16 +170,17 @@ def test_a_station_of_real_devices_before_its_first_day(tmp_path):
     assert not any(f.what == "devices" for f in found)
 
 
-def test_silent_controller(monkeypatch):
+def test_silent_controller(tmp_path):
     """An arm whose controller does not answer fails in the driver's own words."""
-    from tofcapture.devices.faults import ControllerSilent
-
-    def silent(settings):
-        raise ControllerSilent(f"{settings.host} does not answer")
-
-    monkeypatch.setattr("tofcapture.devices.ur_rtde.probe.probe", silent)
-    finding = doctor_station._ask_ur("arm", "driver ur_rtde", {"driver": "ur_rtde", "host": "10.0.0.9"})
-    assert (finding.verdict, finding.found) == ("FAIL", "10.0.0.9 does not answer")
+    file = tmp_path / "station.toml"
+    file.write_text(
+        '[arm]\ndriver = "ur_rtde"\nhost = "127.250.0.8"\n[tof]\ndriver = "sim"\n[stereo]\ndriver = "sim"\n'
+        '[operator]\ndriver = "sim"\n[plan]\ntable = -0.5\ntarget = [0.7, 0, -0.4]\nboard = [0.7, 0, -0.2]\n'
+        "board_normal = [0, 0, 1]\n"
+    )
+    (finding,) = [f for f in doctor_station.look_at_station(str(file)) if f.what == "arm"]
+    assert finding.verdict == "FAIL"
+    assert "127.250.0.8: RTDE's port 30004" in finding.found
     assert "cable" in finding.advice
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tofcapture.camera import Camera
+from tofcapture.devices import Arm, StereoDevice, TofCamera
 from tofcapture.devices.console import ConsoleOperator
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.sim.drivers import DRIVERS as SIM
@@ -83,17 +84,7 @@ def test_example_package_is_found_and_keeps_it(tmp_path):
     assert "keeps the contract" in ran.stdout
 
 
-class _Plain:
-    """Opens and closes, and that is all."""
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        return None
-
-
-class _Tof(_Plain):
+class _Tof(TofCamera):
     info = TofInfo("t", "1", Camera(4, 3, 3.0, 3.0, 1.5, 1.0), np.zeros(3))
     clock = 0
 
@@ -126,6 +117,11 @@ class _Frozen(_Tof):
         return replace(burst, time_ns=np.zeros(frames, np.int64))
 
 
+class _Half:
+    def describe(self):
+        return _Tof.info
+
+
 class _Codes(_Tof):
     def capture(self, frames):
         if frames < 1:
@@ -135,7 +131,13 @@ class _Codes(_Tof):
 
 @pytest.mark.parametrize(
     ("camera", "clause"),
-    [(_Connects, "no I/O"), (_Floats, "uint16"), (_Frozen, "increase"), (_Codes, "TofErrors only")],
+    [
+        (_Connects, "no I/O"),
+        (_Floats, "uint16"),
+        (_Frozen, "increase"),
+        (_Codes, "TofErrors only"),
+        (_Half, "protocol; got .*__enter__.*capture"),
+    ],
 )
 def test_broken_tof_cameras_are_caught(camera, clause):
     """I/O in the constructor, wrong types, frozen clocks and vendors' exceptions are named."""
@@ -144,7 +146,7 @@ def test_broken_tof_cameras_are_caught(camera, clause):
         check_tof(camera)
 
 
-class _Stereo(_Plain):
+class _Stereo(StereoDevice):
     info = StereoInfo("s", "1", Camera(4, 3, 3.0, 3.0, 1.5, 1.0))
     clock, scale, missing = 0, 1.0, np.nan
 
@@ -174,7 +176,7 @@ def test_broken_stereo_cameras_are_caught(camera, clause):
         check_stereo(camera)
 
 
-class _Arm(_Plain):
+class _Arm(Arm):
     clock = 0
     off = 0.0
 

@@ -7,10 +7,10 @@ import pytest
 
 pytest.importorskip("nxlib")
 
+
+from tests.fake_nxlib import FakeCamera, FakeNxLib, installed
 from tofcapture.devices import registry
-from tofcapture.devices.ensenso import Ensenso, metres
-from tofcapture.devices.ensenso_fake import FakeCamera, FakeNxLib, installed
-from tofcapture.devices.ensenso_nxlib import CaptureTimeoutError
+from tofcapture.devices.ensenso import CaptureTimeoutError, Ensenso, metres
 from tofcapture.devices.registry import StationContext
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.testing import check_stereo

@@ -11,8 +11,7 @@ from tofcapture.camera import Camera
 from tofcapture.devices import registry
 from tofcapture.devices.kinematics import HOME, MODELS, forward
 from tofcapture.devices.registry import StationContext, make_device
-from tofcapture.devices.replay_source import Replay
-from tofcapture.devices.replay_station import write_station
+from tofcapture.devices.replay import Replay, write_station
 from tofcapture.devices.station import Station, open_station, read_station
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 from tofcapture.files.view import read_view, view_path
@@ -262,7 +261,7 @@ def test_wrong_tables(recording, tmp_path):
 
 def test_command_writes_the_station(recording, tmp_path):
     """The module's command writes a station and its rig."""
-    command = [sys.executable, "-m", "tofcapture.devices.replay_station", str(recording), str(tmp_path / "s")]
+    command = [sys.executable, "-m", "tofcapture.devices.replay", str(recording), str(tmp_path / "s")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert read_station(tmp_path / "s" / "station.toml")["sim"]["seed"] == 3
     assert done.stdout.strip().endswith("station.toml")

@@ -5,23 +5,25 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("serial")
 
+from tests.tof_module.module import open_terminal
+from tests.tof_module.synthetic import simulated_info, synthetic
 from tofcapture.devices import registry
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.tof_serial import DRIVERS
 from tofcapture.devices.tof_serial.driver import SerialTof
-from tofcapture.devices.tof_serial.errors import (
+from tofcapture.devices.tof_serial.session import (
     FirmwareError,
     LinkLostError,
     ModuleResetError,
     ModuleSilentError,
 )
-from tofcapture.devices.tof_serial.synthetic import simulated_info, synthetic
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD
 from tofcapture.testing import check_tof
@@ -37,8 +39,8 @@ class Modules:
         self.folder, self.running = folder, []
 
     def __call__(self, *options, size="24x18"):
-        command = [sys.executable, "-m", "tofcapture.devices.tof_serial.module", "--size", size, *options]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        command = [sys.executable, "-m", "tests.tof_module", "--size", size, *options]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[1])
         self.running.append(process)
         return process.stdout.readline().strip()
 
@@ -90,8 +92,8 @@ def test_capture_is_what_the_module_saw(modules, tmp_path):
     assert repr(closed) == repr(info)
 
 
-def test_describe_needs_a_contact_or_a_table(tmp_path):
-    """Before the first contact the station's table describes the module; what is missing is named."""
+def test_describe_needs_an_opening_or_a_table(tmp_path):
+    """Before it was first opened the station's table describes the module; what is missing is named."""
     with pytest.raises(ConfigError, match="model, serial, camera"):
         camera("/dev/nowhere", tmp_path).describe()
     shape = {"width": 24, "height": 18, "fx": 20.0, "fy": 21.0, "cx": 11.0, "cy": 9.0}
@@ -173,8 +175,6 @@ def test_wrong_firmware_is_named(modules, tmp_path):
 
 def test_silent_port_is_named(tmp_path):
     """A port on which nobody answers is silence, not a hang."""
-    from tofcapture.devices.tof_serial.module import open_terminal
-
     *ends, name = open_terminal()
     start = time.monotonic()
     with pytest.raises(ModuleSilentError, match="nobody answers"):

@@ -1,25 +1,26 @@
 """The session over links of every kind of badness: each frame comes right or is reported, in simulated time."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 
-from tofcapture.devices.tof_serial.assembly import values
-from tofcapture.devices.tof_serial.core import ModuleCore
-from tofcapture.devices.tof_serial.errors import (
+from tests.tof_module.core import ModuleCore
+from tests.tof_module.module import Noise
+from tests.tof_module.synthetic import simulated_info, synthetic
+from tofcapture.devices.tof_serial.messages import Capture, Frame, Info, Time
+from tofcapture.devices.tof_serial.packet import Kind, Packet, Parser, encode
+from tofcapture.devices.tof_serial.pixels import values
+from tofcapture.devices.tof_serial.session import (
+    MS,
     FirmwareError,
+    Heard,
     LinkTooBadError,
     ModuleRefusedError,
     ModuleResetError,
     ModuleSilentError,
+    Session,
 )
-from tofcapture.devices.tof_serial.messages import Capture, Info, Time
-from tofcapture.devices.tof_serial.noise import Noise
-from tofcapture.devices.tof_serial.packet import Kind, Packet, Parser, encode
-from tofcapture.devices.tof_serial.script import MS, Heard
-from tofcapture.devices.tof_serial.session import Host
-from tofcapture.devices.tof_serial.synthetic import simulated_info, synthetic
 from tofcapture.errors import DeviceError
 
 SMALL = simulated_info(24, 18)
@@ -34,6 +35,7 @@ class Link:
     now: int = 0
     parser: Parser = field(default_factory=Parser)
     chunks: int = 0
+    damaged: int = 0
     hooks: list = field(default_factory=list)
 
     def run(self, script):
@@ -51,7 +53,9 @@ class Link:
         while not found and (piece := self.core.outgoing()):
             self.chunks += len(piece) > 100
             self.now += 20_000
-            found = self.parser.feed(self.damage(piece))
+            arrived = self.damage(piece)
+            self.damaged += arrived != piece
+            found = self.parser.feed(arrived)
         for hook in self.hooks:
             hook(self)
         if not found:
@@ -59,62 +63,65 @@ class Link:
         return Heard(self.now, tuple(found))
 
 
-def link(info=SMALL, seed=0, rate=0.0, **options):
+def link(info=SMALL, seed=0, rate=0.0, core=ModuleCore, **options):
     noise = Noise.every(np.random.default_rng(seed), rate)
-    return Link(ModuleCore(info, synthetic(info, seed), **options), noise)
+    return Link(core(info, synthetic(info, seed), **options), noise)
 
 
-def take(on, host, burst, index):
+def take(on, session, burst, index):
     """Script that uploads one frame."""
-    return host.frame(burst, index, on.core.info.frame_bytes)
+    return session.frame(burst, index, on.core.info.frame_bytes)
 
 
-def begin(on, host, frames=2):
+def begin(on, session, frames=2):
     """Say hello and expose burst 1."""
-    info = on.run(host.hello())
-    on.run(host.expose(1, frames, info.period_us))
+    info = on.run(session.hello())
+    on.run(session.expose(1, frames, info.period_us))
     return info
 
 
 def test_clean_link_gives_the_frames():
     """Over a good link, frames, temperature and exposure times arrive as the module made them."""
-    on, host = link(), Host()
-    info = begin(on, host, 3)
-    assert info == SMALL
+    on, session, clocks = link(), Session(), []
+    start = on.now // 1000
+    assert begin(on, session, 3) == SMALL
+    end = on.now // 1000
     for i in range(3):
-        meta, data = on.run(take(on, host, 1, i))
+        meta, data = on.run(take(on, session, 1, i))
         raw, celsius = synthetic(SMALL, 0)(0, i)
         assert (values(data, raw.shape, 12) == raw).all()
         assert meta.celsius == pytest.approx(celsius)
-        assert meta.clock_us == on.core._burst.start_us + i * SMALL.period_us
-    assert (on.parser.damaged, on.parser.lost) == (0, 0)
+        clocks.append(meta.clock_us)
+    assert start <= clocks[0] < end
+    assert np.diff(clocks).tolist() == [SMALL.period_us] * 2
+    assert on.damaged == 0
 
 
 def check_noise(least_chunks, rate, seed=0):
     """Take frames over a damaging link until so many chunks were sent; returns (right, reported, chunks)."""
     info = simulated_info(48, 36, frames=8)
-    on, host, source = link(info, seed, rate), Host(largest_chunk=256), synthetic(info, seed)
+    on, session, source = link(info, seed, rate), Session(largest_chunk=256), synthetic(info, seed)
     right = reported = burst = 0
-    on.run(host.hello())
+    on.run(session.hello())
     while on.chunks < least_chunks:
         burst += 1
         try:
-            on.run(host.expose(burst, 8, info.period_us))
-            on.run(host.sync())
+            on.run(session.expose(burst, 8, info.period_us))
+            on.run(session.sync())
         except DeviceError:
             reported += 8
             continue
         for i in range(8):
             try:
-                _, data = on.run(take(on, host, burst, i))
+                _, data = on.run(take(on, session, burst, i))
             except DeviceError:
                 reported += 1
                 continue
-            raw, _ = source(on.core._burst.count, i)
+            raw, _ = source(on.core.exposed - 1, i)
             assert (values(data, raw.shape, 12) == raw).all(), "a wrong frame was accepted"
             right += 1
-        on.run(host.release())
-    assert on.parser.damaged > least_chunks // 20
+        on.run(session.release())
+    assert on.damaged > least_chunks // 20
     return right, reported, on.chunks
 
 
@@ -128,23 +135,23 @@ def test_bad_link_gives_right_frames(seed):
 
 def test_chunk_follows_the_link():
     """On a link that breaks long packets the chunk shrinks; when the link is good again it grows."""
-    on, host = link(simulated_info(64, 48), rate=5e-4), Host()
-    begin(on, host)
-    on.run(take(on, host, 1, 0))
-    assert host.chunk < 2048
+    on, session = link(simulated_info(64, 48), rate=5e-4), Session()
+    begin(on, session)
+    on.run(take(on, session, 1, 0))
+    assert session.chunk < 2048
     on.damage = bytes
     for _ in range(8):
-        on.run(take(on, host, 1, 1))
-    assert host.chunk == 16384
+        on.run(take(on, session, 1, 1))
+    assert session.chunk == 16384
 
 
 def test_hopeless_link_is_reported():
     """A link that damages every chunk ends in its named error, after bounded time."""
-    on, host = link(), Host()
-    begin(on, host)
+    on, session = link(), Session()
+    begin(on, session)
     on.damage = lambda piece: piece if len(piece) < 60 else piece[:50]
     with pytest.raises(LinkTooBadError, match="frame 0 lacks"):
-        on.run(take(on, host, 1, 0))
+        on.run(take(on, session, 1, 0))
     assert on.now < 60 * 1000 * MS
 
 
@@ -153,65 +160,65 @@ def test_silence_is_reported():
     for damage in (lambda _: b"", lambda piece: b"\x55" * len(piece)):
         on = Link(ModuleCore(SMALL, synthetic(SMALL, 0)), damage)
         with pytest.raises(ModuleSilentError, match="HELLO"):
-            on.run(Host().hello())
+            on.run(Session().hello())
         assert on.now <= 5000 * MS
 
 
 def test_foreign_protocol_is_named():
     """A module of another protocol version is told apart from a silent one."""
     with pytest.raises(FirmwareError, match="protocol 2, this host speaks 1"):
-        link(protocol=2).run(Host().hello())
+        link(protocol=2).run(Session().hello())
 
 
 def test_reset_in_burst_is_named():
     """A module that starts anew in the middle of a burst is found out, whoever asks first."""
-    on, host = link(reset_in=frozenset({0})), Host()
+    on, session = link(reset_in=frozenset({0})), Session()
     with pytest.raises(ModuleResetError):
-        begin(on, host)
-    begin(on, host)  # burst 1 again: the new start has forgotten it, and takes it
-    on.run(take(on, host, 1, 0))
+        begin(on, session)
+    begin(on, session)  # burst 1 again: the new start has forgotten it, and takes it
+    on.run(take(on, session, 1, 0))
 
 
 def test_reset_before_upload_is_named():
     """A module that starts anew between exposure and upload has no such burst; SYNC finds it too."""
-    for script in (lambda on, host: take(on, host, 1, 0), lambda _, host: host.sync()):
-        on, host = link(), Host()
-        begin(on, host)
+    for script in (lambda on, session: take(on, session, 1, 0), lambda _, session: session.sync()):
+        on, session = link(), Session()
+        begin(on, session)
         on.core.reset(on.now // 1000)
         with pytest.raises(ModuleResetError):
-            on.run(script(on, host))
+            on.run(script(on, session))
 
 
 def test_reset_in_upload_is_named():
     """A module that starts anew while it uploads ends in its named error."""
-    on, host = link(simulated_info(64, 48)), Host(largest_chunk=256)
-    begin(on, host)
+    on, session = link(simulated_info(64, 48)), Session(largest_chunk=256)
+    begin(on, session)
     on.hooks.append(lambda at: at.core.reset(at.now // 1000) if at.chunks == 30 else None)
     with pytest.raises(ModuleResetError):
-        on.run(take(on, host, 1, 0))
+        on.run(take(on, session, 1, 0))
 
 
 def test_capture_twice_exposes_once():
     """The same burst number again does not expose again; another one while exposing is refused."""
-    on, host = link(), Host()
-    info = on.run(host.hello())
-    script = host.request(Kind.CAPTURE, Capture(5, 2).pack(), lambda body: body)
+    on, session = link(), Session()
+    info = on.run(session.hello())
+    script = session.request(Kind.CAPTURE, Capture(5, 2).pack(), lambda body: body)
     on.run(script)
     with pytest.raises(ModuleRefusedError, match="BUSY"):
-        on.run(host.request(Kind.CAPTURE, Capture(6, 2).pack(), lambda body: body))
-    on.run(host.expose(5, 2, info.period_us))
-    on.run(host.expose(5, 2, info.period_us))
-    assert on.core._bursts == 1
+        on.run(session.request(Kind.CAPTURE, Capture(6, 2).pack(), lambda body: body))
+    on.run(session.expose(5, 2, info.period_us))
+    on.run(session.expose(5, 2, info.period_us))
+    assert on.core.exposed == 1
 
 
 def test_refusals_are_errors():
     """Too many frames, frames not exposed and unknown requests come back as errors that say so."""
-    on, host = link(), Host()
-    begin(on, host)
+    on, session = link(), Session()
+    begin(on, session)
     with pytest.raises(ModuleRefusedError, match="TOO_MANY_FRAMES"):
-        on.run(host.expose(2, 100, 1))
+        on.run(session.expose(2, 100, 1))
     with pytest.raises(ModuleRefusedError, match="OUT_OF_RANGE"):
-        on.run(take(on, host, 1, 9))
+        on.run(take(on, session, 1, 9))
     on.core.receive(encode(Packet(0x42, 9, b"")), 0)
     (packet,) = Parser().feed(on.core.outgoing())
     assert (packet.kind, packet.token) == (Kind.REFUSED, 9)
@@ -219,8 +226,8 @@ def test_refusals_are_errors():
 
 def test_late_answers_do_not_fool_the_clock():
     """An answer to an earlier try is not taken for a quick answer to the present one."""
-    host = Host()
-    script = host.sync(pings=1)
+    session = Session()
+    script = session.sync(pings=1)
     script.send(None)
     ask = script.send(Heard(0))
     (first,) = Parser().feed(ask.send)
@@ -236,8 +243,8 @@ def test_late_answers_do_not_fool_the_clock():
 
 def test_malformed_answer_is_the_firmware():
     """A body that is too short, under a right CRC, is the firmware's error and no crash."""
-    host = Host()
-    script = host.hello()
+    session = Session()
+    script = session.hello()
     script.send(None)
     ask = script.send(Heard(0))
     (asked,) = Parser().feed(ask.send)
@@ -245,15 +252,22 @@ def test_malformed_answer_is_the_firmware():
         script.send(Heard(1, (Packet(Kind.INFO, asked.token, b"short"),)))
 
 
+def _wrong_sum(piece):
+    """Change the frame's CRC that the module tells; the packet's own stays right."""
+    for packet in Parser().feed(piece):
+        if packet.kind == Kind.FRAME:
+            frame = Frame.unpack(packet.body)
+            return encode(replace(packet, body=replace(frame, crc=frame.crc ^ 1).pack()))
+    return piece
+
+
 def test_frame_that_is_wrong_in_memory_is_reported():
     """When all chunks are right but the frame's CRC is not, the frame is not accepted."""
-    on, host = link(), Host()
-    begin(on, host)
-    on.core._frame(1, 0, on.now // 1000)
-    data, meta = on.core._packed[0]
-    on.core._packed[0] = (bytes([data[0] ^ 1]) + data[1:], meta)
+    on, session = link(), Session()
+    begin(on, session)
+    on.damage = _wrong_sum
     with pytest.raises(LinkTooBadError, match="the frame's is not"):
-        on.run(take(on, host, 1, 0))
+        on.run(take(on, session, 1, 0))
 
 
 def test_module_survives_anything():
@@ -271,25 +285,27 @@ def test_module_survives_anything():
 
 def test_frame_of_another_size_is_refused():
     """A module that announces a frame of another size is refused before memory is taken for it."""
-    on, host = link(), Host()
-    begin(on, host)
+    on, session = link(), Session()
+    begin(on, session)
     with pytest.raises(ModuleRefusedError, match="expected 99 bytes, the module has 5184"):
-        on.run(host.frame(1, 0, 99))
+        on.run(session.frame(1, 0, 99))
+
+
+class _Repeating(ModuleCore):
+    """Sends its first chunk for ever."""
+
+    first = b""
+
+    def outgoing(self):
+        piece = self.first or super().outgoing()
+        self.first = piece if len(piece) > 250 else b""
+        return piece
 
 
 def test_module_that_repeats_itself_is_no_progress():
     """A module that sends the same chunk for ever ends in its named error, after bounded time."""
-    on, host = link(), Host()
-    begin(on, host)
-    real, kept = on.core._stream, []
-
-    def stream(data, read, token):
-        kept.append(next(real(data, read, token)))
-        while True:
-            yield kept[0]
-
-    on.core._stream = stream
-    host.chunk = 256
+    on, session = link(core=_Repeating), Session(largest_chunk=256)
+    begin(on, session)
     with pytest.raises(LinkTooBadError, match="frame 0 lacks 4928 bytes"):
-        on.run(take(on, host, 1, 0))
+        on.run(take(on, session, 1, 0))
     assert on.now < 60 * 1000 * MS

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from tofcapture.devices import registry, station
+from tofcapture.devices import Arm, Operator, StereoDevice, TofCamera, registry, station
 from tofcapture.devices.console import ConsoleOperator
 from tofcapture.devices.registry import StationContext, load_driver, make_device
 from tofcapture.devices.station import open_station, read_station
@@ -28,7 +28,7 @@ class _Entry:
         return self.target
 
 
-class _Device:
+class _Device(Arm, TofCamera, StereoDevice, Operator):
     """Writes down what is done to it."""
 
     def __init__(self, role, log, broken=False):
@@ -157,6 +157,17 @@ def test_missing_rig_is_refused(fake):
     with pytest.raises(ConfigError, match="rig"), open_station(file):
         pass
     assert log[-1] == "close arm"
+
+
+def test_a_driver_that_lacks_a_method_is_refused_at_once(fake, monkeypatch, tmp_path):
+    """A class without all of its role's protocol is named with what it lacks, before anything is opened."""
+    monkeypatch.setattr(
+        registry, "entry_points", lambda group: [_Entry("half", {"operator": lambda *_: object()})]
+    )
+    context = StationContext({"operator": {"driver": "half"}}, tmp_path)
+    with pytest.raises(ConfigError, match="lacks __enter__, __exit__, can_turn") as caught:
+        make_device("operator", context)
+    assert "tofcapture.devices.Operator" in caught.value.hint
 
 
 def test_unknown_and_broken_drivers(fake, tmp_path):

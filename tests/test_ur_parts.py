@@ -9,21 +9,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.ur_emulator.faults import STAGES, Faults
+from tests.ur_emulator.motion import Motion
+from tests.ur_emulator.process import Emulator
+from tests.ur_emulator.robot import PLAYING, Robot
+from tests.ur_emulator.rtde_server import pack
+from tests.ur_emulator.script import ControlScript
 from tofcapture.devices import faults
 from tofcapture.devices.clearance import stage_of
 from tofcapture.devices.kinematics import HOME
 from tofcapture.devices.station import DEFAULT, open_station
 from tofcapture.devices.ur_rtde import probe as probing
 from tofcapture.devices.ur_rtde import wire
-from tofcapture.devices.ur_rtde.safety import danger, halted
-from tofcapture.devices.ur_rtde.settings import read_settings
-from tofcapture.devices.ur_rtde.way import check_goal, check_way
+from tofcapture.devices.ur_rtde.limits import check_goal, check_way, read_settings
+from tofcapture.devices.ur_rtde.wire import danger, halted
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
-from tofcapture.testing.ur_emulator.faults import STAGES, Faults
-from tofcapture.testing.ur_emulator.motion import Motion
-from tofcapture.testing.ur_emulator.process import Emulator
-from tofcapture.testing.ur_emulator.robot import PLAYING, Robot
-from tofcapture.testing.ur_emulator.script import ControlScript
 
 SETTINGS = read_settings({"host": "127.0.0.1"})
 
@@ -59,8 +59,8 @@ def test_packages_survive_any_cutting(packages, cuts):
 def test_values_survive_their_recipe(vector, number, integer):
     """Vectors, doubles and integers come back bit by bit, in big-endian order."""
     recipe = wire.Recipe(["q", "t", "i"], ["VECTOR6D", "DOUBLE", "INT32"])
-    data = recipe.pack([vector, number, integer])
-    assert len(data) == recipe.size == 60
+    data = pack(recipe, [vector, number, integer])
+    assert len(data) == 60
     assert struct.unpack(">d", data[48:56])[0] == number
     assert recipe.unpack(data) == {"q": vector, "t": number, "i": integer}
 

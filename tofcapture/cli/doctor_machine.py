@@ -149,7 +149,7 @@ def _synchronised() -> list[Finding]:
 
 
 def check_memory() -> list[Finding]:
-    """Shared memory: point maps go through it, and containers give 64 MB."""
+    """Shared memory: processes hand arrays over in it, and containers give 64 MB."""
     shared = Path("/dev/shm")  # noqa: S108  where the kernel keeps it
     if not shared.is_dir():
         return []
@@ -172,7 +172,10 @@ def check_ports(dev: Path = Path("/dev")) -> list[Finding]:
         found = "can be opened" if ours else "is not ours to open"
         out.append(
             Finding(
-                f"port {port.name}", "PASS" if ours else "WARN", found, "" if ours else group_advice(port)
+                f"port {port.name}",
+                "PASS" if ours else "WARN",
+                found,
+                "" if ours else group_advice(port),
             )
         )
     return out

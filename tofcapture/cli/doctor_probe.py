@@ -121,7 +121,7 @@ def look_at_nxlib() -> list[Finding]:
     found = _import("nxlib", ("nxlib",), "pip install 'tofcapture[hardware]', for Ensenso cameras")
     if found[0].verdict != "PASS":
         return found
-    from tofcapture.devices.ensenso_nxlib import library
+    from tofcapture.devices.ensenso import library
 
     try:
         with library(None):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from tofcapture.cli.doctor_probe import Finding, group_advice
+from tofcapture.cli.doctor_probe import Finding
 from tofcapture.errors import TofError
 
 
@@ -28,7 +26,7 @@ def look_at_station(path: str, opening: str = "") -> list[Finding]:
     context = StationContext(config=config, folder=folder)
     for role in ROLES:
         out += _look_at_device(role, context)
-    out += _look_at_rig(config, folder)
+    out += _look_at_rig(context)
     if opening and not any(f.verdict == "FAIL" for f in out):
         try:
             with open_station(file) as station:
@@ -47,64 +45,35 @@ def _look_at_device(role: str, context: Any) -> list[Finding]:
         device = make_device(role, context)
     except TofError as err:
         return [Finding(role, "FAIL", err.message, err.hint)]
-    table = context.config[role]
-    driver, out = table["driver"], []
-    said = f"driver {driver}"
-    if hasattr(device, "describe"):
+    said = f"driver {context.config[role]['driver']}"
+    out = []
+    if role != "operator":
         try:
             info = device.describe()
-            said = f"driver {driver}: {info.model} {info.serial}".rstrip()
+            said = f"{said}: {info.model} {info.serial}".rstrip()
         except TofError as err:
             out.append(Finding(role, "WARN", err.message, err.hint))
-    asked = _ASK.get((role, driver))
-    if asked:
-        out.append(asked(role, said, table))
-    return out or [Finding(role, "PASS", said)]
+    try:
+        there = device.probe()
+    except TofError as err:
+        return [*out, Finding(role, "FAIL", f"{said}: {err.message}", err.hint)]
+    if there or not out:
+        out.append(Finding(role, "PASS", f"{said}; {there}" if there else said))
+    return out
 
 
-def _look_at_rig(config: Mapping[str, Any], folder: Path) -> list[Finding]:
-    """The rig that the station names; simulated cameras know theirs."""
+def _look_at_rig(context: Any) -> list[Finding]:
+    """The rig that the station names, unless a driver knows it."""
     from tofcapture.rig import load_rig
 
-    path = config.get("rig", {}).get("path")
+    path = context.config.get("rig", {}).get("path")
     if path:
         try:
-            load_rig(folder / str(path))
+            load_rig(context.folder / str(path))
         except TofError as err:
             return [Finding("rig", "FAIL", err.message, err.hint)]
         return [Finding("rig", "PASS", str(path))]
-    if {config.get(role, {}).get("driver") for role in ("tof", "stereo")} & {"sim", "replay"}:
+    if "rig" in context.shared:
         return []
     advice = 'add [rig] path = "rig.toml", the bracket\'s drawing for a start; see docs/formats.md'
     return [Finding("rig", "FAIL", "the station names none", advice)]
-
-
-def _ask_ur(role: str, said: str, table: Mapping[str, Any]) -> Finding:
-    """Go through the controller's handshake; nothing is sent that moves."""
-    from tofcapture.devices.ur_rtde.probe import probe as ask
-    from tofcapture.devices.ur_rtde.settings import read_settings
-
-    try:
-        there = ask(read_settings({k: v for k, v in table.items() if k != "driver"}))
-    except TofError as err:
-        return Finding(role, "FAIL", err.message, err.hint)
-    version = ".".join(map(str, there.version))
-    return Finding(role, "PASS", f"{said}; PolyScope {version}, arm {there.serial or 'unknown'} is ready")
-
-
-def _ask_serial(role: str, said: str, table: Mapping[str, Any]) -> Finding:
-    """Look whether the port is there, and ours."""
-    port = str(table.get("port", ""))
-    if "://" in port or not port:
-        return Finding(role, "PASS", said)
-    if not Path(port).exists():
-        return Finding(role, "FAIL", f"{said}: {port} is not there", "plug it in; ls /dev/serial/by-id")
-    if not os.access(port, os.R_OK | os.W_OK):
-        return Finding(role, "FAIL", f"{said}: {port} is not ours to use", group_advice(Path(port)))
-    return Finding(role, "PASS", f"{said}; {port} is there")
-
-
-_ASK: dict[tuple[str, str], Callable[[str, str, Mapping[str, Any]], Finding]] = {
-    ("arm", "ur_rtde"): _ask_ur,
-    ("tof", "tof_serial"): _ask_serial,
-}

@@ -1,37 +1,84 @@
-"""Devices: small protocols, drivers found by entry point, one station that opens them.
+"""Devices: one protocol for each role, drivers found by entry point, one station that opens them.
 
-A driver is a plain class; it inherits nothing. Its constructor does no I/O, ``__enter__`` opens, ``__exit__`` closes,
-``describe`` answers without opening, every verb is idempotent or says that it is not. Nobody names a concrete driver but
+A driver subclasses the protocol of its role, which does what a device may leave out. Its constructor does no I/O,
+``__enter__`` opens, ``__exit__`` closes, ``describe`` answers without opening. Nobody names a concrete driver but
 ``devices.registry``.
 """
 
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
+from tofcapture.errors import DeviceError
 from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth
 from tofcapture.poses import Float64
 
+if TYPE_CHECKING:
+    from tofcapture.rig import Rig
+
 
 class Device(Protocol):
-    """What all devices share: they open and close as context managers."""
+    """What all devices share; every method has a default."""
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    ) -> None:
+        return None
+
+    def probe(self) -> str:
+        """Tell whether the device is there, without opening or disturbing it.
+
+        Returns
+        -------
+        str
+            What was found; empty when the device cannot be asked.
+
+        Raises
+        ------
+        DeviceError
+            It is not there, or not ready.
+        """
+        return ""
+
+    def watch(self, silence: float) -> None:
+        """Look after the open device; a driver host calls this a few times a second from another thread.
+
+        Parameters
+        ----------
+        silence
+            Seconds since the station's process gave a sign of life.
+
+        Raises
+        ------
+        ArmFault
+            Something is wrong: the host then reports this, and ends the driver.
+        """
+        del silence
 
 
 class Arm(Device, Protocol):
     """A robot arm that carries the rig."""
 
+    @property
+    def simulated(self) -> bool:
+        """Nothing moves that could hurt anyone. A real arm moves only in a run that allows it."""
+        return False
+
     def describe(self) -> ArmInfo:
         """Say what this arm is, without opening it."""
+        ...
+
+    def equip(self, rig: Rig) -> None:
+        """Hear what the arm carries, once after opening; for arms that check their own way."""
+        del rig
 
     def state(self) -> ArmState:
         """Measure the joints now."""
+        ...
 
     def move_to(self, joints: Float64) -> ArmState:
         """Move to joint angles (6,) in radians, wait until settled, return the measured state.
@@ -41,9 +88,15 @@ class Arm(Device, Protocol):
         MotionRefused
             The goal is outside the limits or the arm refuses.
         """
+        ...
 
     def stop(self) -> None:
-        """Stop moving now; safe at any time."""
+        """Stop moving now; safe at any time, before opening and after closing too."""
+        ...
+
+    def interrupt(self) -> None:
+        """Make a running ``move_to`` of another thread stop; a driver host calls this before a queued ``stop``."""
+        return
 
 
 class TofCamera(Device, Protocol):
@@ -51,9 +104,11 @@ class TofCamera(Device, Protocol):
 
     def describe(self) -> TofInfo:
         """Say what this camera is, without opening it."""
+        ...
 
     def capture(self, frames: int) -> TofBurst:
         """Take a burst of ``frames`` static frames."""
+        ...
 
 
 class StereoDevice(Device, Protocol):
@@ -61,16 +116,47 @@ class StereoDevice(Device, Protocol):
 
     def describe(self) -> StereoInfo:
         """Say what this camera is, without opening it."""
+        ...
 
     def capture(self) -> StereoFrame:
         """Take one point map."""
+        ...
 
 
-class Operator(Protocol):
+class Operator(Device, Protocol):
     """Who puts the scene on the table: a person at the console, or the simulator."""
+
+    @property
+    def person(self) -> bool:
+        """A person is asked, so that a program may ask in its own way instead."""
+        return False
+
+    @property
+    def can_turn(self) -> bool:
+        """``turn`` works."""
+        return False
 
     def place(self, scene: str) -> None:
         """Return when ``scene`` stands on the table. Idempotent."""
+        ...
+
+    def turn(self, scene: str, angle: float) -> None:
+        """Return when the scene is turned about the vertical.
+
+        Parameters
+        ----------
+        scene
+            Its name.
+        angle
+            From how it stood first, counter-clockwise seen from above, radians.
+
+        Raises
+        ------
+        DeviceError
+            Nobody can turn it.
+        """
+        raise DeviceError(f"nobody can turn {scene!r} by {angle:.2f} rad", hint="record without --turns")
 
     def truth(self) -> Truth | None:
-        """What is exactly true of the view from the present pose; ``None`` in the real world."""
+        """Tell what is exactly true of the view from the present pose; ``None`` in the real world."""
+        return None

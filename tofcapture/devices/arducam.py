@@ -18,15 +18,15 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.devices import TofCamera
+from tofcapture.devices.cameras import ReopenedCamera, tof_info
 from tofcapture.devices.host import hosted
-from tofcapture.errors import ConfigError, DeviceError, FormatError
-from tofcapture.files.info import tof_from
+from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.frames import TofBurst, TofInfo
 
 if TYPE_CHECKING:
@@ -44,42 +44,33 @@ _REQUEST_MS = 2000
 _MISSES = 5  # frames in a row that may fail to come
 
 
-class Arducam:
+class Arducam(ReopenedCamera, TofCamera):
     """One Arducam ToF module, in RAW output.
 
     Parameters
     ----------
     table
-        ``connection`` ("csi" or "usb"), ``index`` (default 0), and the module's description, because the SDK says neither its
-        modulation frequencies nor its phase steps: ``serial``, ``camera``, ``modulation_hz``, ``phase_rad``, ``exposure``; optionally
-        ``model``, ``illuminator``, ``saturation``, ``range_errors``.
+        ``connection`` ("csi" or "usb"), ``index`` (default 0), and the module's description, because the SDK says neither
+        its modulation frequencies nor its phase steps: ``serial``, ``camera``, ``modulation_hz``, ``phase_rad``,
+        ``exposure``; optionally ``model``, ``illuminator``, ``saturation``, ``range_errors``.
     context
         The station; not needed.
     """
 
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
         del context
-        self._info = _described(table)
+        known = {*_SETTINGS, *_REQUIRED, *_OPTIONAL}
+        unknown, missing = sorted(table.keys() - known), [k for k in _REQUIRED if k not in table]
+        if unknown or missing:
+            raise ConfigError(
+                f"[tof] arducam: unknown: {', '.join(unknown) or 'none'}; missing: {', '.join(missing) or 'none'}",
+                hint="see docs/arducam.md",
+            )
+        self._info = tof_info({**_OPTIONAL, **table}, "[tof] arducam", "docs/arducam.md")
         self._connection, self._index = str(table.get("connection", "csi")), int(table.get("index", 0))
         if self._connection not in ("csi", "usb"):
             raise ConfigError(f'[tof] connection: expected "csi" or "usb", got {self._connection!r}')
-        self._stack: ExitStack | None = None
         self._camera: Any = None
-
-    def __enter__(self) -> Self:
-        self._open()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Stop and close the camera; again does nothing."""
-        stack, self._stack, self._camera = self._stack, None, None
-        if stack is not None:
-            stack.close()
 
     def describe(self) -> TofInfo:
         """Say what ``station.toml`` says of this camera; opens nothing."""
@@ -102,28 +93,27 @@ class Arducam:
         """
         if frames < 1:
             raise ConfigError(f"frames: expected at least 1, got {frames}")
-        try:
-            self._open()
+        with self.opened():
             self._frame()  # one may have been waiting since before the arm stood still
-            taken = [self._frame() for _ in range(frames)]
-        except DeviceError:
-            self.close()
-            raise
-        raw, times = zip(*taken, strict=True)
+            raw, times = zip(*(self._frame() for _ in range(frames)), strict=True)
         return TofBurst(np.stack(raw), np.array(times, dtype=np.int64), np.full(frames, np.nan), self._info)
 
-    def _open(self) -> None:
-        if self._camera is not None:
-            return
-        sdk = _sdk()
-        mode = sdk.Connection.CSI if self._connection == "csi" else sdk.Connection.USB
-        with ExitStack() as stack:
-            camera = sdk.ArducamCamera()
-            _succeed(camera.open(mode, self._index), f"open ({self._connection}, {self._index})")
-            stack.callback(camera.close)
-            _succeed(camera.start(sdk.FrameType.RAW), "start RAW")
-            stack.callback(camera.stop)
-            self._camera, self._stack = camera, stack.pop_all()
+    def connect(self, stack: ExitStack) -> None:
+        """Open the module and start its RAW output."""
+        try:
+            import ArducamDepthCamera
+        except ImportError as err:
+            raise ConfigError(
+                f"the driver arducam needs the Python package ArducamDepthCamera: {err}",
+                hint="pip install ArducamDepthCamera, in an environment with numpy below 2",
+            ) from err
+        connections = ArducamDepthCamera.Connection
+        mode = connections.CSI if self._connection == "csi" else connections.USB
+        self._camera = camera = ArducamDepthCamera.ArducamCamera()
+        _succeed(camera.open(mode, self._index), f"open ({self._connection}, {self._index})")
+        stack.callback(camera.close)
+        _succeed(camera.start(ArducamDepthCamera.FrameType.RAW), "start RAW")
+        stack.callback(camera.stop)
 
     def _frame(self) -> tuple[NDArray[np.uint16], int]:
         """One frame (K, H, W) and the host time (ns) when it was handed over."""
@@ -171,40 +161,13 @@ def _phases(frame: Any, info: TofInfo) -> NDArray[np.uint16]:
     return out.astype(np.uint16)
 
 
-def _sdk() -> Any:
-    try:
-        import ArducamDepthCamera
-    except ImportError as err:
-        raise ConfigError(
-            f"the driver arducam needs the Python package ArducamDepthCamera: {err}",
-            hint="pip install ArducamDepthCamera, in an environment with numpy below 2",
-        ) from err
-    return ArducamDepthCamera
-
-
 def _succeed(code: Any, doing: str) -> None:
+    """Turn a code other than success into an error with its name."""
     if int(code) != 0:
         raise DeviceError(
             f"Arducam: {doing}: {getattr(code, 'name', code)}",
             hint="check its cable, its power, the overlay of the CSI port, and that no other program holds it",
         )
-
-
-def _described(table: Mapping[str, Any]) -> TofInfo:
-    known = {*_SETTINGS, *_REQUIRED, *_OPTIONAL}
-    unknown, missing = table.keys() - known, [k for k in _REQUIRED if k not in table]
-    if unknown or missing:
-        raise ConfigError(
-            f"[tof] arducam: unknown: {', '.join(sorted(unknown)) or 'none'}; missing: {', '.join(missing) or 'none'}",
-            hint="see docs/arducam.md",
-        )
-    try:
-        info = tof_from({**_OPTIONAL, **table}, "[tof] arducam")
-    except FormatError as err:
-        raise ConfigError(err.message, hint="see docs/arducam.md") from err
-    if len(info.phase_rad) != len(info.modulation_hz):
-        raise ConfigError("[tof] arducam: expected one phase_rad for each modulation_hz")
-    return info
 
 
 DRIVERS = {"tof": hosted("tof", "tofcapture.devices.arducam:Arducam")}

@@ -86,38 +86,40 @@ def stage_of(config: Mapping[str, Any]) -> Stage:
     return stage
 
 
-def obstacles(model: ArmModel, rig: Rig, stage: Stage, joints: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Say what is in the way at joint angles.
+def body_points(model: ArmModel, rig: Rig, joints: NDArray[np.floating]) -> tuple[Float64, Float64]:
+    """Points of the arm and of what it carries, base frame, metres.
 
     Parameters
     ----------
-    model, rig, stage
-        The arm, what it carries, what stands around it.
+    model, rig
+        The arm and what it carries.
     joints
         (..., 6), radians.
 
     Returns
     -------
-    (..., 4) bool, one per entry of :data:`REASONS`.
+    (..., 40, 3) along the links, and (..., 3, 3): flange, ToF camera, stereo camera.
     """
     frames = link_frames(model, joints)
-    origins = frames[..., :3, 3]
-    flange = frames[..., 5, :, :]
-    cameras = np.stack(
-        [(flange @ check_transform(T))[..., :3, 3] for T in (rig.T_flange_tof, rig.T_flange_stereo)], axis=-2
-    )
+    origins, flange = frames[..., :3, 3], frames[..., 5, :, :]
     a, b = origins[..., :-1, None, :], origins[..., 1:, None, :]
     links = a + (b - a) * _SAMPLES[:, None]
-    links = links.reshape(*links.shape[:-3], links.shape[-3] * len(_SAMPLES), 3)
-    far = origins[..., 5, None, :]
+    carried = [flange, *(flange @ check_transform(T) for T in (rig.T_flange_tof, rig.T_flange_stereo))]
+    tools = np.stack([T[..., :3, 3] for T in carried], axis=-2)
+    return links.reshape(*links.shape[:-3], links.shape[-3] * len(_SAMPLES), 3), tools
+
+
+def obstacles(model: ArmModel, rig: Rig, stage: Stage, joints: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Say what is in the way at joint angles (..., 6), radians; returns (..., 4), one per entry of :data:`REASONS`."""
+    links, tools = body_points(model, rig, joints)
+    cameras = tools[..., 1:, :]
+    origins = np.concatenate([links[..., :: len(_SAMPLES), :], tools[..., :1, :]], axis=-2)
     wrist = np.concatenate([origins[..., 3:, :], cameras], axis=-2)
     return np.stack(
         [
             _low(links, stage, _LINK) | _low(cameras, stage, _BLOCK),
             _inside(links, stage, _LINK) | _inside(cameras, stage, _BLOCK),
-            (np.linalg.norm(np.concatenate([far, cameras], axis=-2)[..., :2], axis=-1) < _COLUMN).any(
-                axis=-1
-            ),
+            (np.linalg.norm(tools[..., :2], axis=-1) < _COLUMN).any(axis=-1),
             (_to_segment(wrist, origins[..., 0, :], origins[..., 1, :]) < 2 * _LINK).any(axis=-1)
             | (_to_segment(cameras, origins[..., 1, :], origins[..., 2, :]) < _LINK + _BLOCK).any(axis=-1),
         ],
@@ -148,11 +150,16 @@ def _to_segment(points: Float64, a: Float64, b: Float64) -> Float64:
     return out
 
 
+def straight_way(start: Float64, goal: Float64, step: float) -> Float64:
+    """Joint angles (N, 6) along the straight way in joint space, ``step`` radians apart at most, both ends included."""
+    count = max(2, int(np.ceil(np.abs(goal - start).max() / step)) + 1)
+    way: Float64 = start + (goal - start) * np.linspace(0, 1, count)[:, None]
+    return way
+
+
 def is_clear(model: ArmModel, rig: Rig, stage: Stage, start: Float64, goal: Float64) -> bool:
     """Tell whether the straight way in joint space from (6,) to (6,) meets nothing."""
-    steps = max(2, int(np.ceil(np.abs(goal - start).max() / _STEP)) + 1)
-    path = start + (goal - start) * np.linspace(0, 1, steps)[:, None]
-    return not obstacles(model, rig, stage, path).any()
+    return not obstacles(model, rig, stage, straight_way(start, goal, _STEP)).any()
 
 
 def route(model: ArmModel, rig: Rig, stage: Stage, start: Float64, goal: Float64) -> list[Float64]:

@@ -7,14 +7,15 @@ import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TextIO
 
-from tofcapture.errors import ConfigError, DeviceError
-from tofcapture.frames import Truth
+from tofcapture.devices import Operator
+from tofcapture.devices.registry import check_keys
+from tofcapture.errors import DeviceError
 
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
 
 
-class ConsoleOperator:
+class ConsoleOperator(Operator):
     """Asks on stderr, waits for Enter on stdin.
 
     Parameters
@@ -27,6 +28,9 @@ class ConsoleOperator:
         Where to ask and to listen; the terminal unless a test says otherwise.
     """
 
+    person = True
+    can_turn = True
+
     def __init__(
         self,
         table: Mapping[str, Any],
@@ -35,8 +39,7 @@ class ConsoleOperator:
         answer: TextIO | None = None,
     ) -> None:
         del context
-        if table:
-            raise ConfigError(f"[operator] console takes no settings, got {', '.join(sorted(table))}")
+        check_keys(table, (), "[operator] console")
         self._ask, self._answer = ask, answer
         self._placed: str | None = None
 
@@ -53,38 +56,19 @@ class ConsoleOperator:
         self._wait(f"Put {scene!r} on the table", scene)
         self._placed = scene
 
-    def _wait(self, wish: str, scene: str) -> None:
+    def turn(self, scene: str, angle: float) -> None:
+        """Ask for the scene to be turned, and wait until it is; see :class:`Operator`."""
+        degrees = math.degrees(angle)
+        self._wait(f"Turn {scene!r} to {degrees:.0f} deg, counter-clockwise from how it stood first", scene)
+
+    def _wait(self, request: str, scene: str) -> None:
         """Ask, and return when Enter was pressed."""
         ask, answer = self._ask or sys.stderr, self._answer or sys.stdin
         if self._answer is None and not answer.isatty():
             raise DeviceError(f"nobody is at the console to place {scene!r}", hint="run it in a terminal")
-        print(f"{wish}, step out of the arm's reach, press Enter.", file=ask, flush=True)
+        print(f"{request}, step out of the arm's reach, press Enter.", file=ask, flush=True)
         if not answer.readline():
             raise DeviceError(f"the console's input ended before {scene!r} was placed")
-
-    def turn(self, scene: str, angle: float) -> None:
-        """Ask for the scene to be turned about the vertical, and wait until it is.
-
-        Parameters
-        ----------
-        scene
-            Its name.
-        angle
-            From how it stood first, counter-clockwise seen from above, radians.
-
-        Raises
-        ------
-        DeviceError
-            Nobody can answer.
-        """
-        self._wait(
-            f"Turn {scene!r} to {math.degrees(angle):.0f} deg, counter-clockwise from how it stood first",
-            scene,
-        )
-
-    def truth(self) -> Truth | None:
-        """Nobody knows the real world exactly."""
-        return None
 
 
 DRIVERS = {"operator": ConsoleOperator}

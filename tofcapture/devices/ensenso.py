@@ -10,18 +10,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices import ensenso_nxlib as sdk
-from tofcapture.devices.contact import read_contact, write_contact
+from tofcapture.devices import StereoDevice
+from tofcapture.devices.cameras import ReopenedCamera, described, read_description, write_description
 from tofcapture.devices.host import hosted
+from tofcapture.devices.registry import check_keys
 from tofcapture.errors import ConfigError, DeviceError, FormatError
 from tofcapture.files.info import stereo_from
 from tofcapture.frames import StereoFrame, StereoInfo
@@ -29,23 +29,33 @@ from tofcapture.frames import StereoFrame, StereoInfo
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
 
-_SETTINGS = ("serial", "flexview", "exposure", "timeout", "link", "contact", "library")
+_SETTINGS = ("serial", "flexview", "exposure", "timeout", "link", "description", "library")
 _DESCRIPTION = ("model", "camera")
+_TIMEOUTS = ("CaptureTimeout", "DeviceTimeout", "Timeout")
+_HINTS = {
+    "CaptureTimeout": "network: a direct link, jumbo frames, no switch; a long FlexView needs a longer [stereo] timeout",
+    "CameraNotFound": "the camera went away: check its cable and power",
+    "NxLibInitializationNotAllowed": "the SDK is being closed; start the program anew",
+}
 
 
-class Ensenso:
+class CaptureTimeoutError(DeviceError):
+    """The images did not arrive in time."""
+
+
+class Ensenso(ReopenedCamera, StereoDevice):
     """One Ensenso camera.
 
-    Its point maps are in the left eye's frame, in metres, NaN where nothing was measured. The exposure time is found by the
-    camera on the first capture after opening and held from then on, unless ``exposure`` names one.
+    Its point maps are in the left eye's frame, in metres, NaN where nothing was measured. The camera finds the exposure
+    time on the first capture after opening, and it is held from then on, unless ``exposure`` names one.
 
     Parameters
     ----------
     table
         ``serial`` (required); ``flexview`` (image pairs, 3 to 8 on an N35; 0 is off; default 8); ``exposure`` (seconds);
-        ``timeout`` (seconds for one capture, default 5); ``link``: ``"refuse"`` (default) or ``"clear"`` a link that would turn point
-        maps into another frame; ``contact`` (file that keeps what the camera said of itself); ``library`` (path of the SDK's
-        shared library); ``model`` and ``camera`` to describe it before the first contact.
+        ``timeout`` (seconds for one capture, default 5); ``link``: ``"refuse"`` (default) or ``"clear"`` a link that would
+        turn point maps into another frame; ``description`` (file that keeps what the camera said of itself); ``library``
+        (path of the SDK's shared library); ``model`` and ``camera`` to describe it before it was first opened.
     context
         The station.
     """
@@ -53,47 +63,22 @@ class Ensenso:
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
         self._table = _checked(table)
         self._serial = str(table["serial"])
-        self._contact = Path(context.folder) / str(table.get("contact", f"ensenso-{self._serial}.toml"))
-        self._stack: ExitStack | None = None
+        self._file = Path(context.folder) / str(table.get("description", f"ensenso-{self._serial}.toml"))
         self._camera: Any = None
-        self._frozen: float | None = None
-
-    def __enter__(self) -> Self:
-        self._open()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the camera and the SDK; again does nothing."""
-        stack, self._stack, self._camera = self._stack, None, None
-        if stack is not None:
-            stack.close()
+        self._exposure: float | None = None
 
     def describe(self) -> StereoInfo:
-        """Say what this camera is, from ``station.toml`` and the contact file; opens nothing.
+        """Say what this camera is, from ``station.toml`` and the description file; opens nothing.
 
         Raises
         ------
         ConfigError
             The camera was never opened and ``station.toml`` does not describe it.
         """
-        said = {
-            **(read_contact(self._contact) or {}),
-            **{k: v for k, v in self._table.items() if k in _DESCRIPTION},
-        }
-        said["serial"] = self._serial
-        missing = [k for k in _DESCRIPTION if k not in said]
-        if missing:
-            raise ConfigError(
-                f"[stereo] {self._serial}: expected {', '.join(missing)}, which the camera has not said",
-                hint="open it once, or write model and [stereo.camera] into station.toml",
-            )
+        where = f"[stereo] {self._serial}"
+        said = described(read_description(self._file), self._table, _DESCRIPTION, where)
         try:
-            return stereo_from(said, f"[stereo] {self._serial}")
+            return stereo_from({**said, "serial": self._serial}, where)
         except FormatError as err:
             raise ConfigError(err.message, hint="see docs/ensenso.md") from err
 
@@ -111,63 +96,65 @@ class Ensenso:
         DeviceError
             The camera does not deliver; the next call opens it anew.
         """
-        try:
+        with suppress(CaptureTimeoutError), self.opened():
             try:
-                return self._attempt(tries=2)
-            except sdk.CaptureTimeoutError:
-                self.close()
-                return self._attempt(tries=1)
-        except DeviceError:
-            self.close()
-            raise
+                return self._take()
+            except CaptureTimeoutError:
+                return self._take()
+        with self.opened():
+            return self._take()
 
-    def _attempt(self, tries: int) -> StereoFrame:
-        info = self._open()
-        while True:
-            tries -= 1
-            try:
-                start = time.monotonic_ns()
-                sdk.expose(self._camera, float(self._table["timeout"]))
-                middle = (start + time.monotonic_ns()) // 2
-                break
-            except sdk.CaptureTimeoutError:
-                if not tries:
-                    raise
-        self._freeze()
-        points = metres(sdk.point_map(self._camera), info.camera.shape, self._serial)
-        return StereoFrame(points, middle, info)
+    def _take(self) -> StereoFrame:
+        start = time.monotonic_ns()
+        timeout = round(float(self._table["timeout"]) * 1e3)
+        with _errors("capturing"):
+            self._camera.capture({"Timeout": timeout})
+        middle = (start + time.monotonic_ns()) // 2
+        if self._exposure is None:
+            self._exposure = _held_exposure(self._camera)
+        with _errors("computing the point map"):
+            self._camera.compute_disparity_map()
+            self._camera.compute_point_map()
+            points_mm = self._camera.get_point_map()
+        info = self.describe()
+        return StereoFrame(metres(points_mm, info.camera.shape, self._serial), middle, info)
 
-    def _freeze(self) -> None:
-        """Hold the exposure that the camera found, so that all views of a scene are lit alike."""
-        if self._frozen is None:
-            self._frozen = sdk.freeze_exposure(self._camera)
-
-    def _open(self) -> StereoInfo:
-        if self._camera is None:
-            with ExitStack() as stack:
-                stack.enter_context(sdk.library(self._table.get("library")))
-                camera = stack.enter_context(sdk.opened(self._serial))
-                sdk.check_link(camera, clear=self._table["link"] == "clear")
-                exposure = self._table.get("exposure")
-                self._frozen = self._frozen if exposure is None else float(exposure)
-                sdk.configure(camera, int(self._table["flexview"]), self._frozen)
-                self._admit(sdk.said_by(camera))
-                self._camera, self._stack = camera, stack.pop_all()
-        return self.describe()
-
-    def _admit(self, said: Mapping[str, Any]) -> None:
-        """Refuse intrinsics other than the known ones; remember them on first contact."""
-        known = read_contact(self._contact)
+    def connect(self, stack: ExitStack) -> None:
+        """Open SDK and camera, set its parameters, and see that its calibration is the known one."""
+        stack.enter_context(library(self._table.get("library")))
+        camera = self._camera = stack.enter_context(_open_camera(self._serial))
+        _check_link(camera, clear=self._table["link"] == "clear")
+        if (exposure := self._table.get("exposure")) is not None:
+            self._exposure = float(exposure)
+        _configure(camera, int(self._table["flexview"]), self._exposure)
+        said, known = _said_by(camera), read_description(self._file)
         if known is not None and known.get("camera") != said["camera"]:
             raise DeviceError(
-                f"[stereo] {self._serial}: its calibration is not the one of {self._contact.name}",
+                f"[stereo] {self._serial}: its calibration is not the one of {self._file.name}",
                 hint="it was calibrated anew: delete that file, begin a new recording, align again",
             )
-        write_contact(self._contact, said)
+        write_description(self._file, said)
+
+
+def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Check ``[stereo]``, fill in what it leaves out."""
+    check_keys(table, (*_SETTINGS, *_DESCRIPTION), "[stereo]")
+    if not isinstance(table.get("serial"), str):
+        raise ConfigError(
+            f'[stereo] serial: expected the camera\'s serial, "171197", got {table.get("serial")!r}'
+        )
+    full = {"flexview": 8, "timeout": 5.0, "link": "refuse", **table}
+    if full["link"] not in ("refuse", "clear"):
+        raise ConfigError(f'[stereo] link: expected "refuse" or "clear", got {full["link"]!r}')
+    if full["flexview"] not in range(17) or full["flexview"] == 1:
+        raise ConfigError(
+            f"[stereo] flexview: expected 0 (off) or 2 to 16 image pairs, got {full['flexview']!r}"
+        )
+    return full
 
 
 def metres(points_mm: NDArray[np.float32], shape: tuple[int, int], serial: str) -> NDArray[np.float32]:
-    """Point map in metres.
+    """Turn a point map into metres.
 
     Parameters
     ----------
@@ -203,25 +190,170 @@ def metres(points_mm: NDArray[np.float32], shape: tuple[int, int], serial: str) 
     return points
 
 
-def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
-    known = (*_SETTINGS, *_DESCRIPTION)
-    unknown = table.keys() - set(known)
-    if unknown:
+# Below is what speaks to ``nxlib``. The names of the SDK's tree are the vendor's own.
+
+
+@contextmanager
+def library(path: str | None) -> Iterator[None]:
+    """Load and initialise the SDK; finalise it on leaving.
+
+    Raises
+    ------
+    ConfigError
+        The Python package or the SDK's shared library is missing.
+    DeviceError
+        The SDK does not initialise.
+    """
+    try:
+        from nxlib import api
+    except ImportError as err:
         raise ConfigError(
-            f"[stereo] does not know {', '.join(sorted(unknown))}", hint=f"it knows {', '.join(known)}"
-        )
-    if not isinstance(table.get("serial"), str):
+            "the driver ensenso needs the Python package nxlib", hint="pip install nxlib"
+        ) from err
+    try:
+        with _errors("initialising the Ensenso SDK"):
+            api.initialize(path=path)
+    except OSError as err:
         raise ConfigError(
-            f'[stereo] serial: expected the camera\'s serial, "171197", got {table.get("serial")!r}'
-        )
-    full = {"flexview": 8, "timeout": 5.0, "link": "refuse", **table}
-    if full["link"] not in ("refuse", "clear"):
-        raise ConfigError(f'[stereo] link: expected "refuse" or "clear", got {full["link"]!r}')
-    if full["flexview"] not in range(17) or full["flexview"] == 1:
-        raise ConfigError(
-            f"[stereo] flexview: expected 0 (off) or 2 to 16 image pairs, got {full['flexview']!r}"
-        )
-    return full
+            f"the Ensenso SDK is not installed: {err}",
+            hint="install it from ensenso.com, or point NXLIB_LIBRARY_PATH or [stereo] library to libNxLib64.so",
+        ) from err
+    try:
+        yield
+    finally:
+        with suppress(DeviceError), _errors("finalising the Ensenso SDK"):
+            api.finalize()
+
+
+@contextmanager
+def _open_camera(serial: str) -> Iterator[Any]:
+    """Open the camera of that serial number; close it on leaving.
+
+    Raises
+    ------
+    DeviceError
+        No such camera, of another kind, in use, or out of reach.
+    """
+    from nxlib import NxLibItem, context
+    from nxlib.constants import VAL_STEREO, VAL_STRUCTURED_LIGHT
+
+    try:
+        with _errors(f"opening camera {serial}"):
+            camera = context.Camera.from_serial(serial, [VAL_STEREO, VAL_STRUCTURED_LIGHT])
+            camera.open()
+    except context.CameraNotFoundError as err:
+        there = ", ".join(NxLibItem()["Cameras"].value()) or "none"
+        raise DeviceError(
+            f"no Ensenso camera {serial}; there are: {there}",
+            hint="check power, network and firewall; look with NxView",
+        ) from err
+    except context.CameraTypeError as err:
+        raise DeviceError(f"camera {serial}: {err}", hint="name the stereo camera's serial number") from err
+    except context.CameraOpenError as err:
+        raise DeviceError(
+            f"camera {serial} cannot be opened",
+            hint="another program holds it, or its IP address is unreachable",
+        ) from err
+    try:
+        yield camera
+    finally:
+        with suppress(DeviceError), _errors(f"closing camera {serial}"):
+            camera.close()
+
+
+def _check_link(camera: Any, *, clear: bool) -> None:
+    """Refuse a link, which would move point maps into another frame.
+
+    ``clear`` clears it first, in the SDK's memory and not in the camera. Raises DeviceError when a link is left.
+    """
+    with _errors("reading the camera's link"):
+        link = camera["Link"]
+        if clear and _linked(link):
+            link["Target"].set_string("")
+            link["Rotation"]["Angle"].set_double(0.0)
+            for axis in range(3):
+                link["Translation"][axis].set_double(0.0)
+        if _linked(link):
+            raise DeviceError(
+                f"the camera is linked to {link.value().get('Target') or 'a pose'!r}: its point maps are not in its own frame",
+                hint='set link = "clear" in [stereo], or clear workspace and hand-eye calibration in NxView',
+            )
+
+
+def _linked(link: Any) -> bool:
+    """Tell whether a link leads anywhere: to another frame by name, or by a motion."""
+    if not link.exists() or link.is_null():
+        return False
+    says: Mapping[str, Any] = link.value()
+    turned = (says.get("Rotation") or {}).get("Angle") or 0.0
+    return bool(says.get("Target")) or bool(turned) or any(says.get("Translation") or ())
+
+
+def _configure(camera: Any, flexview: int, exposure: float | None) -> None:
+    """Set trigger, FlexView (image pairs, 0 for off) and exposure (seconds; ``None`` lets the camera find it)."""
+    with _errors("setting the camera's parameters"):
+        capture = camera["Parameters"]["Capture"]
+        capture["TriggerMode"] = "Software"
+        capture["FlexView"] = flexview or False
+        capture["AutoExposure"] = exposure is None
+        if exposure is not None:
+            capture["Exposure"] = exposure * 1e3
+
+
+def _held_exposure(camera: Any) -> float:
+    """Hold the exposure that the last capture found, so that all views are lit alike; returns it in seconds."""
+    with _errors("holding the exposure"):
+        capture = camera["Parameters"]["Capture"]
+        found_ms = float(capture["Exposure"].as_double())
+        capture["AutoExposure"] = False
+        capture["Exposure"] = found_ms
+    return found_ms * 1e-3
+
+
+def _said_by(camera: Any) -> dict[str, Any]:
+    """Model, serial, and intrinsics of the rectified left eye, whose grid the point map has.
+
+    The SDK's matrix is indexed by column, then row.
+    """
+    with _errors("reading the camera's calibration"):
+        columns = camera["Calibration"]["Stereo"]["Left"]["Camera"].value()
+        width, height = camera["Sensor"]["Size"].value()
+        intrinsics = {
+            "width": int(width),
+            "height": int(height),
+            "fx": float(columns[0][0]),
+            "fy": float(columns[1][1]),
+            "cx": float(columns[2][0]),
+            "cy": float(columns[2][1]),
+        }
+        return {"model": camera.get_model_name(), "serial": camera.get_serial_number(), "camera": intrinsics}
+
+
+@contextmanager
+def _errors(doing: str) -> Iterator[None]:
+    """Turn the library's codes into our errors, all of them, here and nowhere else."""
+    from nxlib.exception import NxLibError, NxLibException
+
+    try:
+        yield
+    except NxLibException as err:
+        symbol, text = _symbol(err)
+        kind = CaptureTimeoutError if symbol in _TIMEOUTS or err.get_error_code() == 8 else DeviceError
+        raise kind(
+            f"Ensenso: {doing}: {symbol}: {text}", hint=_HINTS.get(symbol, "look at the camera with NxView")
+        ) from err
+    except NxLibError as err:
+        raise DeviceError(f"Ensenso: {doing}: {err}", hint="look at the camera with NxView") from err
+
+
+def _symbol(err: Any) -> tuple[str, str]:
+    """Error symbol and sentence, of a command where it was one."""
+    from nxlib.exception import NxLibException
+
+    if err.is_command_execution_failure():
+        with suppress(NxLibException):
+            return err.get_command_error_symbol(), err.get_command_error_text()
+    return err.get_error_text(), str(err.get_item_path())
 
 
 # Opening waits until the SDK has looked through the network for cameras.

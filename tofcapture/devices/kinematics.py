@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tofcapture.errors import ConfigError
+from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.poses import Float64
 
 _ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
@@ -75,6 +75,25 @@ def arm_model(name: str) -> ArmModel:
     if name not in MODELS:
         raise ConfigError(f"arm model: expected one of {', '.join(MODELS)}, got {name!r}")
     return MODELS[name]
+
+
+def check_joints(model: ArmModel, joints: ArrayLike) -> Float64:
+    """Check a goal (6,) in radians; returns a copy, float64.
+
+    Raises
+    ------
+    MotionRefused
+        Not six finite angles, or one beyond the model's limit.
+    """
+    goal = np.array(joints, dtype=np.float64)
+    if goal.shape != (6,) or not np.isfinite(goal).all():
+        raise MotionRefused(f"move: expected 6 finite joint angles, got {goal.tolist()}")
+    worst = int(np.abs(goal).argmax())
+    if abs(goal[worst]) > model.limit:
+        raise MotionRefused(
+            f"move: joint {worst + 1} at {goal[worst]:.3f} rad is outside +-{model.limit:.3f} rad"
+        )
+    return goal
 
 
 def wrap(angle: ArrayLike) -> Float64:

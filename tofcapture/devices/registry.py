@@ -1,22 +1,25 @@
 """Drivers, found by entry point.
 
-An entry point of the group ``tofcapture.drivers`` is named as the driver is in ``station.toml`` and points at a mapping
-``DRIVERS: {role: factory}``. A factory takes the device's own table and the station's context and returns a device; like
-every constructor of a driver it does no I/O.
+An entry point of the group ``tofcapture.drivers`` has the driver's name in ``station.toml``. It points at a mapping
+``DRIVERS: {role: factory}``. A factory takes the device's own table and the station's context, and returns a device
+without doing any I/O.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import importlib
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from tofcapture.errors import ConfigError, TofError
+from tofcapture.devices import Arm, Operator, StereoDevice, TofCamera
+from tofcapture.errors import ConfigError, DeviceError, TofError
 
 GROUP = "tofcapture.drivers"
-ROLES = ("arm", "tof", "stereo", "operator")
+_PROTOCOLS: dict[str, type] = {"arm": Arm, "tof": TofCamera, "stereo": StereoDevice, "operator": Operator}
+ROLES = tuple(_PROTOCOLS)
 
 
 @dataclass(frozen=True)
@@ -30,8 +33,8 @@ class StationContext:
     folder
         Where that file lies; relative paths in it start here.
     shared
-        Drivers that belong together keep what they share here, for instance the simulated world. The station puts every
-        device here, under its role, as soon as it is open.
+        What drivers of one station share, such as the simulated world. The station puts every open device here under
+        its role. A driver that knows where the cameras sit on the flange puts a nominal ``Rig`` here under ``rig``.
     allow_motion
         The operator allowed real arms to move, in this run.
     """
@@ -45,18 +48,27 @@ class StationContext:
 Factory = Callable[[Mapping[str, Any], StationContext], Any]
 
 
+def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
+    """Refuse settings that a driver does not know.
+
+    Raises
+    ------
+    ConfigError
+        Names them, and those that are known; ``where`` is ``[tof]`` or the like.
+    """
+    known = tuple(known)
+    if unknown := sorted(table.keys() - set(known)):
+        hint = f"it knows {', '.join(known)}" if known else "it takes no settings"
+        raise ConfigError(f"{where} does not know {', '.join(unknown)}", hint=hint)
+
+
 def found_drivers() -> dict[str, EntryPoint]:
     """All registered drivers by name, not yet imported."""
     return {entry.name: entry for entry in sorted(entry_points(group=GROUP), key=lambda e: e.name)}
 
 
 def load_driver(name: str) -> Mapping[str, Factory]:
-    """Import a driver.
-
-    Returns
-    -------
-    Mapping
-        Role -> factory.
+    """Import a driver; returns role -> factory.
 
     Raises
     ------
@@ -88,7 +100,7 @@ def make_device(role: str, context: StationContext) -> Any:
     Raises
     ------
     ConfigError
-        The table is missing or names no driver, the driver is unknown or does not do this role.
+        The table is missing or names no driver, the driver is unknown, does not do this role, or lacks a method of it.
     """
     table = context.config.get(role)
     if not isinstance(table, Mapping) or not isinstance(table.get("driver"), str):
@@ -99,4 +111,32 @@ def make_device(role: str, context: StationContext) -> Any:
         raise ConfigError(
             f"[{role}] driver {name!r}: expected a driver for {role}, it has {', '.join(sorted(drivers))}"
         )
-    return drivers[role]({k: v for k, v in table.items() if k != "driver"}, context)
+    device = drivers[role]({k: v for k, v in table.items() if k != "driver"}, context)
+    if missing := lacking(role, device):
+        raise ConfigError(
+            f"[{role}] driver {name!r} lacks {', '.join(missing)}",
+            hint=f"its class should subclass tofcapture.devices.{_PROTOCOLS[role].__name__}; see docs/drivers.md",
+        )
+    return device
+
+
+def lacking(role: str, device: object) -> list[str]:
+    """Names of the role's protocol that a device does not have."""
+    names = {n for n in dir(_PROTOCOLS[role]) if not n.startswith("_")} | {"__enter__", "__exit__"}
+    return sorted(names - set(dir(device)))
+
+
+def make_target(target: str, table: Mapping[str, Any], context: StationContext) -> Any:
+    """Import ``module:name`` and call it with a device's table and the station's context, as a driver host does.
+
+    Raises
+    ------
+    DeviceError
+        It does not import.
+    """
+    module, _, name = target.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as err:
+        raise DeviceError(f"driver {target}: {err}") from err
+    return factory(table, context)

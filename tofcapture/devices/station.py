@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture.devices import Arm, Operator, StereoDevice, TofCamera
-from tofcapture.devices.consent import StillArm
 from tofcapture.devices.registry import ROLES, StationContext, make_device
-from tofcapture.errors import ConfigError, DeviceError, TofError
+from tofcapture.errors import ConfigError, DeviceError, MotionRefused, TofError
 from tofcapture.files.info import stereo_table, tof_table
+from tofcapture.frames import ArmInfo, ArmState
+from tofcapture.poses import Float64
 from tofcapture.rig import Rig, load_rig
 
 _TABLES = (*ROLES, "sim", "plan", "rig")
@@ -55,7 +56,7 @@ class Station:
     @property
     def simulated(self) -> bool:
         """True when no real arm moves."""
-        return bool(getattr(self.arm, "simulated", False))
+        return self.arm.simulated
 
     def describe(self) -> dict[str, Any]:
         """Say which devices these are, as JSON types; equal for the same devices."""
@@ -131,10 +132,10 @@ def open_station(
     with ExitStack() as stack:
         devices = _open_all(context, stack)
         rig = _rig(context)
-        if hasattr(devices["arm"], "equip"):
-            devices["arm"].equip(rig)
-        if not (allow_motion or getattr(devices["arm"], "simulated", False)):
-            devices["arm"] = StillArm(devices["arm"])
+        arm: Arm = devices["arm"]
+        arm.equip(rig)
+        if not (allow_motion or arm.simulated):
+            devices["arm"] = LockedArm(arm)
         station = Station(**devices, rig=rig, config=config)
         try:
             yield station
@@ -143,15 +144,46 @@ def open_station(
             raise
 
 
+class LockedArm(Arm):
+    """A real arm in a run that does not allow motion: everything but ``move_to`` works.
+
+    Parameters
+    ----------
+    arm
+        The open arm behind it.
+    """
+
+    def __init__(self, arm: Arm) -> None:
+        self._arm = arm
+
+    def describe(self) -> ArmInfo:
+        """Say what this arm is."""
+        return self._arm.describe()
+
+    def state(self) -> ArmState:
+        """Measure the joints now."""
+        return self._arm.state()
+
+    def stop(self) -> None:
+        """Stop moving now."""
+        self._arm.stop()
+
+    def move_to(self, joints: Float64) -> ArmState:
+        """Raise MotionRefused, always."""
+        del joints
+        raise MotionRefused(
+            f"the arm {self.describe().model} is real and motion was not allowed in this run",
+            hint="look at --dry-run, clear the workspace, then add --allow-motion",
+        )
+
+
 def _open_all(context: StationContext, stack: ExitStack) -> dict[str, Any]:
     """Make and open each device; one error that names every device that failed."""
     devices: dict[str, Any] = {}
     failures: list[tuple[str, TofError]] = []
     for role in ROLES:
         try:
-            device = make_device(role, context)
-            # An operator has nothing to open, unless its driver says so.
-            devices[role] = stack.enter_context(device) if hasattr(device, "__enter__") else device
+            devices[role] = stack.enter_context(make_device(role, context))
             context.shared[role] = devices[role]
         except TofError as err:
             failures.append((role, err))
@@ -172,13 +204,13 @@ def _refuse(failures: list[tuple[str, TofError]]) -> None:
 
 
 def _rig(context: StationContext) -> Rig:
-    """Load the named rig; the simulated world knows a nominal one."""
+    """Load the named rig, or take the nominal one of a driver that knows it."""
     if path := context.config.get("rig", {}).get("path"):
         return load_rig(context.folder / str(path))
-    if "sim" in context.shared:
-        rig: Rig = context.shared["sim"].nominal_rig()
-        return rig
-    raise ConfigError(
-        'station: expected [rig] path = "rig.toml"',
-        hint="the bracket's drawing does for a start; see docs/formats.md",
-    )
+    if "rig" not in context.shared:
+        raise ConfigError(
+            'station: expected [rig] path = "rig.toml"',
+            hint="the bracket's drawing does for a start; see docs/formats.md",
+        )
+    rig: Rig = context.shared["rig"]
+    return rig

@@ -111,7 +111,7 @@ def hold_arm(arm: Arm) -> Iterator[None]:
     """
     import fcntl
 
-    if getattr(arm, "simulated", False):
+    if arm.simulated:
         yield
         return
     info = arm.describe()

@@ -151,7 +151,7 @@ def _world(station: Station) -> dict[str, Any]:
 
 def _check_turns(station: Station, plan: Plan) -> None:
     """Refuse a plan with turns of the object where nobody can turn it."""
-    if any(view.turn for view in plan.views) and not hasattr(station.operator, "turn"):
+    if any(view.turn for view in plan.views) and not station.operator.can_turn:
         raise ConfigError(
             "turns: this station's operator cannot turn the object",
             hint='a person can: [operator] driver = "console", in a terminal; or record without --turns',
@@ -190,7 +190,7 @@ def _take_all(taking: _Taking, missing: list[PlannedView], kept: int, progress: 
         taking.watch.before_view(planned.index)
         _check_space(taking.recording, 1)
         if planned.turn != turned:
-            taking.station.operator.turn(taking.scene, planned.turn)  # type: ignore[attr-defined]
+            taking.station.operator.turn(taking.scene, planned.turn)
             turned = planned.turn
         try:
             _take(taking, planned)

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tofcapture.devices.registry import lacking
 from tofcapture.errors import MotionRefused, TofError
 from tofcapture.frames import ArmInfo, ArmState, Truth
 from tofcapture.poses import Float64, check_transform
@@ -33,7 +34,13 @@ Prepare = Callable[[Any], None]
 _NEAR = np.radians(0.1)  # rad; a settled arm is this close to its goal
 _NUDGE = 0.02  # rad
 _IO = ("socket.connect", "socket.bind", "subprocess.Popen", "os.posix_spawn", "os.fork", "pty.spawn")
-_watched = threading.local()
+
+
+class _Watched(threading.local):
+    seen: list[str] | None = None
+
+
+_watched = _Watched()
 _installed = threading.Lock()
 _hooks: list[object] = []
 
@@ -54,7 +61,7 @@ def nothing(device: Any) -> None:
 
 
 def _hook(event: str, args: tuple[Any, ...]) -> None:
-    seen = getattr(_watched, "seen", None)
+    seen = _watched.seen
     if seen is None:
         return
     device_file = event == "open" and isinstance(args[0], str) and args[0].startswith("/dev/")
@@ -78,11 +85,12 @@ def _watching(clause: str) -> Iterator[None]:
     require(not seen, clause, seen)
 
 
-def made(make: Make) -> Any:
-    """Construct and describe twice, without I/O."""
+def made(make: Make, role: str) -> Any:
+    """Construct and describe, without I/O; all of the role's protocol must be there."""
     with _watching("the constructor and describe() do no I/O"):
         device = make()
-        if hasattr(device, "describe"):
+        require(not (missing := lacking(role, device)), f"the device has all of a {role}'s protocol", missing)
+        if role != "operator":
             device.describe()
     return device
 
@@ -133,7 +141,7 @@ def check_arm(make: Make, prepare: Prepare = nothing, goal: ArrayLike | None = N
     ContractError
         The clause that is broken.
     """
-    arm = made(make)
+    arm = made(make, "arm")
     check_describe(arm, ArmInfo)
     _refuses(arm.state, TofError, "state() of an arm that is not open raises a TofError")
     with arm as opened:
@@ -209,7 +217,7 @@ def check_operator(make: Make, scene: str = "mug") -> None:
     ContractError
         The clause that is broken.
     """
-    operator = made(make)
+    operator = made(make, "operator")
     operator.place(scene)
     operator.place(scene)
     try:

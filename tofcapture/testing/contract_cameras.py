@@ -38,7 +38,7 @@ def check_tof(make: Make, prepare: Prepare = nothing, frames: int = 2) -> None:
     ContractError
         The clause that is broken.
     """
-    camera = made(make)
+    camera = made(make, "tof")
     info = check_describe(camera, TofInfo)
     only_named_errors(
         lambda: camera.capture(1), "capture() of a camera that is not open raises TofErrors only"
@@ -89,7 +89,7 @@ def check_stereo(make: Make, prepare: Prepare = nothing) -> None:
     ContractError
         The clause that is broken.
     """
-    camera = made(make)
+    camera = made(make, "stereo")
     info = check_describe(camera, StereoInfo)
     only_named_errors(camera.capture, "capture() of a camera that is not open raises TofErrors only")
     last = None

@@ -7,18 +7,16 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
+from tofcapture.devices import Arm, Device, StereoDevice, TofCamera
 from tofcapture.devices.faults import ArmFault, HostLost
-from tofcapture.devices.host.child import make
 from tofcapture.devices.host.process import Host
+from tofcapture.devices.registry import StationContext, make_target
 from tofcapture.errors import ConfigError, DeviceError
-
-if TYPE_CHECKING:
-    from tofcapture.devices.registry import StationContext
-    from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
-    from tofcapture.poses import Float64
-    from tofcapture.rig import Rig
+from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
+from tofcapture.poses import Float64
+from tofcapture.rig import Rig
 
 # Seconds; a driver's own deadlines are laid over them.
 DEADLINES = {
@@ -34,39 +32,38 @@ _GUARD = 3.0  # s beyond the deadline of opening; a child whose parent is silent
 _PAUSES = (0.5, 1.0, 2.0)  # s before the first, second ... new child
 
 
-class HostedDevice:
-    """A driver that lives in a child process.
+class HostedDevice(Device):
+    """A driver that lives in a child process; :func:`hosted` makes them.
 
     Parameters
     ----------
-    name
-        Role, for messages.
+    role
+        For messages.
     target
-        ``module:name`` of the driver's factory, which takes (table, context). Its constructor does no I/O: it also runs here,
-        to answer ``describe``.
+        ``module:name`` of the driver's factory, which takes (table, context). Its constructor does no I/O: it also runs
+        here, to answer ``describe`` and ``probe``.
     table, context
         The device's table and its station. What devices share stays here.
     deadlines
         Seconds by verb, laid over :data:`DEADLINES`.
-    respawn
-        How often a lost child is replaced; 0 for arms, for which a person decides.
     overdue
         What it means for this device when a call exceeds its deadline.
     """
 
+    respawn = 3  # how often a lost child is replaced
+
     def __init__(
         self,
-        name: str,
+        role: str,
         target: str,
         table: Mapping[str, Any],
         context: StationContext,
         deadlines: Mapping[str, float],
-        respawn: int = 0,
-        overdue: type[ArmFault] = HostLost,
+        overdue: type[ArmFault],
     ) -> None:
-        self._name, self._overdue = name, overdue
-        self._left = self._respawn = respawn
-        self._local = make(target, table, context)
+        self._role, self._overdue = role, overdue
+        self._left = self.respawn
+        self._local = make_target(target, table, context)
         self._order = {"target": target, "table": dict(table), "context": replace(context, shared={})}
         self._deadlines = {**DEADLINES, **deadlines}
         self._host: Host | None = None
@@ -77,7 +74,7 @@ class HostedDevice:
             return self
         if self._host is not None:
             self._host.close()
-        self._left = self._respawn
+        self._left = self.respawn
         try:
             self._start()
         except BaseException:
@@ -103,18 +100,13 @@ class HostedDevice:
             host.close()
 
     @property
-    def simulated(self) -> bool:
-        """What the driver says of itself."""
-        return bool(getattr(self._local, "simulated", False))
-
-    @property
     def pid(self) -> int | None:
         """Process id of the child, while it is open."""
         return None if self._host is None else self._host.pid
 
-    def describe(self) -> Any:
-        """Ask the driver that lives here; nothing is opened."""
-        return self._local.describe()
+    def probe(self) -> str:
+        """Ask whether the device is there; nothing is opened and no child is started."""
+        return str(self._local.probe())
 
     def call(self, verb: str, *args: Any) -> Any:
         """Call a method of the driver, one at a time.
@@ -127,54 +119,57 @@ class HostedDevice:
             What the driver raised.
         """
         with self._one:
-            return self._do(verb, args)
-
-    def _do(self, verb: str, args: tuple[Any, ...]) -> Any:
-        host = self._living()
-        try:
-            return host.call(verb, args, self._deadlines.get(verb, 10.0))
-        except ArmFault as fault:
-            host.kill(fault)
-            raise
+            host = self._living()
+            try:
+                return host.call(verb, args, self._deadlines.get(verb, 10.0))
+            except ArmFault as fault:
+                host.kill(fault)
+                raise
 
     def _start(self) -> None:
         guard = _GUARD + self._deadlines["__enter__"]
-        self._host = Host(self._name, self._order, guard, self._overdue)
+        self._host = Host(self._role, self._order, guard, self._overdue)
         try:
             self._host.call("__enter__", (), self._deadlines["__enter__"], quiet=True)
         except DeviceError as err:
             self._host.kill(err)
             raise
         except BaseException:
-            self._host.kill(HostLost(f"{self._name}: not opened"))
+            self._host.kill(HostLost(f"{self._role}: not opened"))
             raise
 
     def _living(self) -> Host:
-        """The child; a new one if it was lost and may be replaced."""
+        """Give the child; a new one if it was lost and may be replaced."""
         if self._host is None:
-            raise DeviceError(f"{self._name} is not open", hint="use the station as a context manager")
+            raise DeviceError(f"{self._role} is not open", hint="use the station as a context manager")
         while self._host.lost is not None:
             if self._left == 0:
                 raise self._host.lost
-            time.sleep(_PAUSES[min(self._respawn - self._left, len(_PAUSES) - 1)])
+            time.sleep(_PAUSES[min(self.respawn - self._left, len(_PAUSES) - 1)])
             self._left -= 1
             self._host.close()
             self._start()
         return self._host
 
 
-class HostedArm(HostedDevice):
-    """An arm in a child process."""
+class HostedArm(HostedDevice, Arm):
+    """An arm in a child process; a lost one is not replaced, for a person must look first."""
+
+    respawn = 0
+
+    @property
+    def simulated(self) -> bool:
+        """What the driver says of itself."""
+        return bool(self._local.simulated)
 
     def describe(self) -> ArmInfo:
         """Say what this arm is, without opening it."""
-        info: ArmInfo = super().describe()
+        info: ArmInfo = self._local.describe()
         return info
 
     def equip(self, rig: Rig) -> None:
         """Tell the arm what it carries, for its checks of the way."""
-        if hasattr(self._local, "equip"):
-            self.call("equip", rig)
+        self.call("equip", rig)
 
     def state(self) -> ArmState:
         """Measure the joints now."""
@@ -200,12 +195,12 @@ class HostedArm(HostedDevice):
             host.kill(err)
 
 
-class HostedTof(HostedDevice):
+class HostedTof(HostedDevice, TofCamera):
     """A ToF camera in a child process."""
 
     def describe(self) -> TofInfo:
         """Say what this camera is, without opening it."""
-        info: TofInfo = super().describe()
+        info: TofInfo = self._local.describe()
         return info
 
     def capture(self, frames: int) -> TofBurst:
@@ -214,12 +209,12 @@ class HostedTof(HostedDevice):
         return burst
 
 
-class HostedStereo(HostedDevice):
+class HostedStereo(HostedDevice, StereoDevice):
     """A stereo camera in a child process."""
 
     def describe(self) -> StereoInfo:
         """Say what this camera is, without opening it."""
-        info: StereoInfo = super().describe()
+        info: StereoInfo = self._local.describe()
         return info
 
     def capture(self) -> StereoFrame:
@@ -228,11 +223,7 @@ class HostedStereo(HostedDevice):
         return frame
 
 
-_KINDS: dict[str, tuple[type[HostedDevice], int]] = {
-    "arm": (HostedArm, 0),
-    "tof": (HostedTof, 3),
-    "stereo": (HostedStereo, 3),
-}
+_KINDS: dict[str, type[HostedDevice]] = {"arm": HostedArm, "tof": HostedTof, "stereo": HostedStereo}
 
 
 def hosted(
@@ -240,7 +231,7 @@ def hosted(
     target: str,
     deadlines: Mapping[str, float] | None = None,
     overdue: type[ArmFault] = HostLost,
-) -> Callable[[Mapping[str, Any], StationContext], HostedDevice]:
+) -> Callable[[Mapping[str, Any], StationContext], Any]:
     """Make a factory, for ``DRIVERS``, of a driver that lives in a child process.
 
     Parameters
@@ -261,9 +252,8 @@ def hosted(
     """
     if role not in _KINDS:
         raise ConfigError(f"hosted driver: expected a role of {', '.join(_KINDS)}, got {role!r}")
-    kind, respawn = _KINDS[role]
 
     def factory(table: Mapping[str, Any], context: StationContext) -> HostedDevice:
-        return kind(role, target, table, context, deadlines or {}, respawn, overdue)
+        return _KINDS[role](role, target, table, context, deadlines or {}, overdue)
 
     return factory

@@ -1,11 +1,13 @@
-"""The parent's side: start a driver's process, call it within deadlines, notice its silence, kill it."""
+"""The parent's side: start a driver's process, call it within deadlines, notice its silence, kill it.
+
+Messages are pickles; both ends are this program.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import itertools
 import os
-import select
 import subprocess
 import sys
 import tempfile
@@ -13,13 +15,13 @@ import threading
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future
+from multiprocessing.connection import Pipe
 from typing import Any
 
 from tofcapture.devices.faults import ArmFault, HostLost
-from tofcapture.devices.host import channel
-from tofcapture.devices.host.child import BEAT
 from tofcapture.errors import DeviceError
 
+BEAT = 0.2  # s between signs of life, both ways
 SILENCE = 4.0  # s without a sign of life, after which a child is taken for dead
 START = 30.0  # s for Python and the driver's module to load
 _LAST_WORDS = 400  # characters of what the library printed, for the error message
@@ -45,7 +47,7 @@ class Host:
     ) -> None:
         self._name, self._overdue = name, overdue
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as the child
-        self._end, other = channel.pair()
+        self._end, other = Pipe()
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tofcapture.devices.host", str(other.fileno())],
             pass_fds=[other.fileno()],
@@ -63,7 +65,7 @@ class Host:
         self.lost: DeviceError | None = None
         hello: Future[Any] = Future()
         self._pending[0] = hello
-        channel.send(self._end, {**order, "path": sys.path, "guard": guard})
+        self._end.send({**order, "path": sys.path, "guard": guard})
         self._thread = threading.Thread(target=self._run, name=f"host {name}", daemon=True)
         self._thread.start()
         try:
@@ -115,7 +117,7 @@ class Host:
 
     def _post(self, message: Any) -> None:
         with self._sending:
-            channel.send(self._end, message)
+            self._end.send(message)
 
     def _wait(self, future: Future[Any], verb: str, deadline: float) -> Any:
         try:
@@ -131,8 +133,8 @@ class Host:
         spoke = 0.0
         while self.lost is None:
             try:
-                if select.select([self._end], [], [], BEAT / 2)[0]:
-                    self._take(*channel.receive(self._end))
+                if self._end.poll(BEAT / 2):
+                    self._take(*self._end.recv())
                 if time.monotonic() - spoke > BEAT:
                     spoke = time.monotonic()
                     self._post(None)

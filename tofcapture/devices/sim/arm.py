@@ -7,11 +7,12 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from tofcapture.devices.kinematics import HOME, arm_model, forward
+from tofcapture.devices import Arm
+from tofcapture.devices.kinematics import HOME, arm_model, check_joints, forward
+from tofcapture.devices.registry import check_keys
 from tofcapture.devices.sim import hashed_generator
-from tofcapture.errors import ConfigError, DeviceError, MotionRefused
+from tofcapture.errors import DeviceError
 from tofcapture.frames import ArmInfo, ArmState
 from tofcapture.poses import Float64, exp
 
@@ -49,7 +50,7 @@ def shared_clock(context: StationContext) -> SimClock:
     return clock
 
 
-class SimArm:
+class SimArm(Arm):
     """Simulated six-axis arm.
 
     Parameters
@@ -63,9 +64,7 @@ class SimArm:
     simulated = True  # moves nothing that could hurt anyone
 
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
-        unknown = table.keys() - {"model"}
-        if unknown:
-            raise ConfigError(f"[arm] does not know {', '.join(sorted(unknown))}", hint="it knows model")
+        check_keys(table, ("model",), "[arm]")
         self._context = context
         self._model = arm_model(str(table.get("model", "ur10e")))
         self._joints: Float64 | None = None
@@ -102,7 +101,7 @@ class SimArm:
         """
         from tofcapture.devices.sim.world import shared_world
 
-        goal = _joints(joints, self._model.limit)
+        goal = check_joints(self._model, joints)
         shared_world(self._context).faults.before_move()
         self._go(goal)
         return self.state()
@@ -120,14 +119,3 @@ class SimArm:
 
     def stop(self) -> None:
         """Do nothing: a simulated move is over when it returns."""
-
-
-def _joints(joints: ArrayLike, limit: float) -> Float64:
-    """Check joint angles as a real controller would."""
-    goal = np.array(joints, dtype=np.float64)
-    if goal.shape != (6,) or not np.isfinite(goal).all():
-        raise MotionRefused(f"move: expected 6 finite joint angles, got {goal.tolist()}")
-    if np.abs(goal).max() > limit:
-        worst = int(np.abs(goal).argmax())
-        raise MotionRefused(f"move: joint {worst + 1} at {goal[worst]:.3f} rad is outside +-{limit:.3f} rad")
-    return goal

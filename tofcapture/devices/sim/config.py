@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from tofcapture.camera import Camera
+from tofcapture.devices.registry import check_keys
 from tofcapture.devices.sim import sensor as sensors
 from tofcapture.devices.sim import stereo as stereos
 from tofcapture.devices.sim.scene import SceneObject
@@ -83,14 +84,6 @@ class WorldFile:
     seed: int
 
 
-def refuse_unknown(table: Mapping[str, Any], known: set[str], where: str) -> None:
-    """Raise :class:`ConfigError` for keys that are not known, with those that are."""
-    if unknown := table.keys() - known:
-        raise ConfigError(
-            f"{where} does not know {', '.join(sorted(unknown))}", hint=f"it knows {', '.join(sorted(known))}"
-        )
-
-
 def read_constants(overrides: Mapping[str, Any], where: str) -> Constants:
     """Read the simulator's constants: constants.toml with ``overrides`` (tables of the same names) laid over it.
 
@@ -103,7 +96,7 @@ def read_constants(overrides: Mapping[str, Any], where: str) -> Constants:
 
     def table(name: str) -> dict[str, Any]:
         given = overrides.get(name, {})
-        refuse_unknown(given, set(defaults[name]), f"{where}: [{name}]")
+        check_keys(given, set(defaults[name]), f"{where}: [{name}]")
         return {**defaults[name], **given}
 
     def made(kind: Callable[..., _T], name: str, values: Mapping[str, Any]) -> _T:
@@ -149,7 +142,7 @@ def load_world(path: Path) -> WorldFile:
         raise ConfigError(f"{path}: cannot read the world: {err}") from err
     except tomllib.TOMLDecodeError as err:
         raise ConfigError(f"{path}: not TOML: {err}") from err
-    refuse_unknown(table, {"units", "seed", "camera", "object", *TABLES}, f"{path}: a world")
+    check_keys(table, {"units", "seed", "camera", "object", *TABLES}, f"{path}: a world")
     units = str(table.get("units", ""))
     scale = metres_per(units, f"{path}: units")
     if "illuminator" in table.get("tof", {}):
@@ -170,7 +163,7 @@ def load_world(path: Path) -> WorldFile:
 
 
 def _object(table: Mapping[str, Any], folder: Path, units: str, where: str) -> SceneObject:
-    refuse_unknown(table, _OBJECT_KEYS, where)
+    check_keys(table, _OBJECT_KEYS, where)
     if ("mesh" in table) == ("family" in table):
         raise ConfigError(f"{where}: expected either mesh or family")
     if "mesh" in table:

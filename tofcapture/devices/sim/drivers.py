@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from tofcapture.devices import Device, Operator, StereoDevice, TofCamera
 from tofcapture.errors import ConfigError
 from tofcapture.frames import StereoFrame, StereoInfo, TofBurst, TofInfo, Truth
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tofcapture.devices.sim.world import SimWorld
 
 
-class _InWorld:
+class _InWorld(Device):
     """Opens by joining the shared world; there is nothing to close."""
 
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
@@ -35,7 +35,7 @@ class _InWorld:
     def _here(self) -> SimWorld:
         """The world at the arm's pose: an arm that is not simulated is asked for it, the simulated one has said it."""
         arm = self._context.shared.get("arm")
-        if arm is not None and not getattr(arm, "simulated", False):
+        if arm is not None and not arm.simulated:
             state = arm.state()
             self._world.set_pose(state.T_base_flange, state.joints.round(5).tobytes())
         return self._world
@@ -44,7 +44,8 @@ class _InWorld:
     def _clock(self) -> Callable[[], int]:
         from tofcapture.devices.sim.arm import shared_clock
 
-        if not getattr(self._context.shared.get("arm"), "simulated", True):
+        arm = self._context.shared.get("arm")
+        if arm is not None and not arm.simulated:
             return time.monotonic_ns
         return shared_clock(self._context)
 
@@ -52,13 +53,8 @@ class _InWorld:
         _ = self._world
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
 
-
-class SimTof(_InWorld):
+class SimTof(_InWorld, TofCamera):
     """The simulated ToF camera."""
 
     def describe(self) -> TofInfo:
@@ -73,7 +69,7 @@ class SimTof(_InWorld):
         return self._here.tof(frames, self._clock)
 
 
-class SimStereo(_InWorld):
+class SimStereo(_InWorld, StereoDevice):
     """The simulated stereo camera."""
 
     def describe(self) -> StereoInfo:
@@ -87,7 +83,7 @@ class SimStereo(_InWorld):
         return replace(frame, points=np.full_like(frame.points, np.nan)) if empty else frame
 
 
-class SimOperator(_InWorld):
+class SimOperator(_InWorld, Operator):
     """Who changes the scene in the simulated world, and knows the truth about it."""
 
     def place(self, scene: str) -> None:

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tofcapture.devices.registry import check_keys
 from tofcapture.devices.sim import VERSION, hashed_generator
-from tofcapture.devices.sim.config import TABLES, Constants, load_world, read_constants, refuse_unknown
+from tofcapture.devices.sim.config import TABLES, Constants, load_world, read_constants
 from tofcapture.devices.sim.faults import FaultPlan, Faults, read_faults
 from tofcapture.devices.sim.light import Light, exact_view, light_at_pixels
 from tofcapture.devices.sim.scene import Caster, SceneObject, merge
@@ -235,7 +236,7 @@ def shared_world(context: StationContext) -> SimWorld:
     """
     if "sim" not in context.shared:
         table = dict(context.config.get("sim", {}))
-        refuse_unknown(table, {"seed", "meshes", "mesh_unit", "faults", *TABLES}, "[sim]")
+        check_keys(table, {"seed", "meshes", "mesh_unit", "faults", *TABLES}, "[sim]")
         folder, unit = table.get("meshes"), str(table.get("mesh_unit", "m"))
         paths = {} if folder is None else {p.stem: p for p in mesh_files(context.folder / folder)}
         world = SimWorld(

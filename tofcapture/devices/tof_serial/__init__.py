@@ -1,4 +1,4 @@
-"""A ToF module on a serial link: our framing, a driver, and a simulated module; docs/serial-protocol.md is the reference.
+"""A ToF module on a serial link: our framing and a driver; docs/serial-protocol.md is the reference.
 
 ::
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-_PPM = 1e-6
-MOST_DRIFT = 500 * _PPM  # a bad crystal has 100
+MOST_DRIFT = 500e-6  # a bad crystal has 100e-6
 _SPAN_NS = 2_000_000_000  # below this, drift drowns in the round trip's uncertainty
 
 

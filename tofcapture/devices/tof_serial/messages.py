@@ -5,25 +5,16 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
-from tofcapture.devices.tof_serial.packing import packed_size
+from tofcapture.devices.tof_serial.pixels import packed_size
 
 CELSIUS_UNKNOWN = -0x8000
+DATA = struct.Struct("<IHI")  # burst, frame, offset; then the whitened bytes
 
 
 class MalformedError(ValueError):
     """A body whose CRC is right but whose layout is not: an error in the other side's software."""
-
-
-def _unpack(layout: struct.Struct, body: bytes, what: str) -> tuple[Any, ...]:
-    if len(body) < layout.size:
-        raise MalformedError(f"{what}: expected at least {layout.size} bytes, got {len(body)}")
-    return layout.unpack_from(body)
-
-
-def _text(data: bytes) -> str:
-    return data.split(b"\0")[0].decode("ascii", errors="replace")
 
 
 class Progress(IntEnum):
@@ -46,8 +37,38 @@ class Reason(IntEnum):
     SENSOR = 7
 
 
+class Body:
+    """A body of numbers in a fixed layout, the dataclass's fields in order; bytes behind it belong to later versions."""
+
+    LAYOUT: ClassVar[struct.Struct]
+
+    def pack(self) -> bytes:
+        """Write the body."""
+        return self.LAYOUT.pack(*vars(self).values())
+
+    @classmethod
+    def unpack(cls, body: bytes) -> Self:
+        """Read the body; raises MalformedError when it is too short or impossible."""
+        return cls(*cls._numbers(body))
+
+    @classmethod
+    def _numbers(cls, body: bytes) -> tuple[Any, ...]:
+        if len(body) < cls.LAYOUT.size:
+            raise MalformedError(
+                f"{cls.__name__}: expected at least {cls.LAYOUT.size} bytes, got {len(body)}"
+            )
+        return cls.LAYOUT.unpack_from(body)
+
+    @classmethod
+    def _rows(cls, body: bytes, row: struct.Struct, count: int) -> list[tuple[int, ...]]:
+        """Rows that follow the fixed layout."""
+        if len(body) < cls.LAYOUT.size + count * row.size:
+            raise MalformedError(f"{cls.__name__}: expected {count} rows, got {len(body)} bytes")
+        return [row.unpack_from(body, cls.LAYOUT.size + i * row.size) for i in range(count)]
+
+
 @dataclass(frozen=True)
-class Info:
+class Info(Body):
     """INFO, the answer to HELLO.
 
     Attributes
@@ -92,22 +113,17 @@ class Info:
     model: str
     serial: str
 
-    _LAYOUT = struct.Struct("<HHIHHBBHHII4I3i32s16s")
+    LAYOUT = struct.Struct("<HHIHHBBHHII4I3i32s16s")
     _CHANNEL = struct.Struct("<IH")
-
-    @property
-    def values(self) -> int:
-        """Values of one frame."""
-        return len(self.hz) * self.height * self.width
 
     @property
     def frame_bytes(self) -> int:
         """Bytes of one packed frame."""
-        return packed_size(self.values, self.bits)
+        return packed_size(len(self.hz) * self.height * self.width, self.bits)
 
     def pack(self) -> bytes:
         """Write the body."""
-        head = self._LAYOUT.pack(
+        head = self.LAYOUT.pack(
             *self.firmware, self.boot, self.width, self.height, self.bits, len(self.hz), self.frames, self.chunk,
             self.exposure_us, self.period_us, *self.intrinsics, *self.illuminator_um,
             self.model.encode("ascii", "replace"), self.serial.encode("ascii", "replace"),
@@ -116,18 +132,14 @@ class Info:
 
     @classmethod
     def unpack(cls, body: bytes) -> Self:
-        """Read the body; bytes behind it belong to later versions."""
-        v = _unpack(cls._LAYOUT, body, "INFO")
+        """Read the body; raises MalformedError when it is too short or impossible."""
+        v = cls._numbers(body)
         major, minor, boot, width, height, bits, channels, frames, chunk, exposure, period = v[:11]
-        if len(body) < cls._LAYOUT.size + channels * cls._CHANNEL.size:
-            raise MalformedError(f"INFO: expected {channels} channels, got {len(body)} bytes")
+        rows = cls._rows(body, cls._CHANNEL, channels)
         if bits not in (12, 16) or not (width and height and channels and frames and chunk and period):
             raise MalformedError(
-                f"INFO: impossible: {width} x {height} x {channels}, {bits} bits, {frames} frames"
+                f"Info: impossible: {width} x {height} x {channels}, {bits} bits, {frames} frames"
             )
-        rows = [
-            cls._CHANNEL.unpack_from(body, cls._LAYOUT.size + i * cls._CHANNEL.size) for i in range(channels)
-        ]
         return cls(
             (major, minor), boot, width, height, bits, frames, chunk, exposure, period, v[11:15], v[15:18],
             tuple(r[0] for r in rows), tuple(r[1] for r in rows), _text(v[18]), _text(v[19]),
@@ -135,81 +147,45 @@ class Info:
 
 
 @dataclass(frozen=True)
-class Time:
+class Time(Body):
     """TIME, the answer to SYNC: boot number, and microseconds on the module's clock when SYNC arrived."""
 
     boot: int
     clock_us: int
-    _LAYOUT = struct.Struct("<IQ")
-
-    def pack(self) -> bytes:
-        """Write the body."""
-        return self._LAYOUT.pack(self.boot, self.clock_us)
-
-    @classmethod
-    def unpack(cls, body: bytes) -> Self:
-        """Read the body."""
-        return cls(*_unpack(cls._LAYOUT, body, "TIME"))
+    LAYOUT = struct.Struct("<IQ")
 
 
 @dataclass(frozen=True)
-class Capture:
+class Capture(Body):
     """CAPTURE: expose ``frames`` frames as burst ``burst``; the same number again does nothing."""
 
     burst: int
     frames: int
-    _LAYOUT = struct.Struct("<IH")
-
-    def pack(self) -> bytes:
-        """Write the body."""
-        return self._LAYOUT.pack(self.burst, self.frames)
-
-    @classmethod
-    def unpack(cls, body: bytes) -> Self:
-        """Read the body."""
-        return cls(*_unpack(cls._LAYOUT, body, "CAPTURE"))
+    LAYOUT = struct.Struct("<IH")
 
 
 @dataclass(frozen=True)
-class State:
-    """STATE, the answer to CAPTURE, STATUS and RELEASE: which burst the memory holds and how many frames are exposed."""
+class BurstState(Body):
+    """STATE, the answer to CAPTURE, STATUS and RELEASE: which burst the memory holds, and how many frames are exposed."""
 
     boot: int
     burst: int
     progress: int
     done: int
-    _LAYOUT = struct.Struct("<IIBH")
-
-    def pack(self) -> bytes:
-        """Write the body."""
-        return self._LAYOUT.pack(self.boot, self.burst, self.progress, self.done)
-
-    @classmethod
-    def unpack(cls, body: bytes) -> Self:
-        """Read the body."""
-        return cls(*_unpack(cls._LAYOUT, body, "STATE"))
+    LAYOUT = struct.Struct("<IIBH")
 
 
 @dataclass(frozen=True)
-class FrameKey:
+class FrameKey(Body):
     """META (and the beginning of READ, FRAME and DATA): one frame of one burst."""
 
     burst: int
     frame: int
-    _LAYOUT = struct.Struct("<IH")
-
-    def pack(self) -> bytes:
-        """Write the body."""
-        return self._LAYOUT.pack(self.burst, self.frame)
-
-    @classmethod
-    def unpack(cls, body: bytes) -> Self:
-        """Read the body."""
-        return cls(*_unpack(cls._LAYOUT, body, "META"))
+    LAYOUT = struct.Struct("<IH")
 
 
 @dataclass(frozen=True)
-class Frame:
+class Frame(Body):
     """FRAME, the answer to META.
 
     Attributes
@@ -233,18 +209,7 @@ class Frame:
     clock_us: int
     centi_celsius: int
     saturated: int
-    _LAYOUT = struct.Struct("<IHIIQhI")
-
-    def pack(self) -> bytes:
-        """Write the body."""
-        return self._LAYOUT.pack(
-            self.burst, self.frame, self.size, self.crc, self.clock_us, self.centi_celsius, self.saturated
-        )
-
-    @classmethod
-    def unpack(cls, body: bytes) -> Self:
-        """Read the body."""
-        return cls(*_unpack(cls._LAYOUT, body, "FRAME"))
+    LAYOUT = struct.Struct("<IHIIQhI")
 
     @property
     def celsius(self) -> float:
@@ -253,48 +218,47 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Read:
-    """READ: send these byte ranges of a frame in payloads of at most ``chunk`` bytes, then END."""
+class Read(Body):
+    """READ: send these byte ranges (start, stop) of a frame in payloads of at most ``chunk`` bytes, then END."""
 
     burst: int
     frame: int
     chunk: int
     ranges: tuple[tuple[int, int], ...]
-    _LAYOUT = struct.Struct("<IHHB")
+    LAYOUT = struct.Struct("<IHHB")
     _RANGE = struct.Struct("<II")
 
     def pack(self) -> bytes:
-        """Write the body; ranges are (start, stop)."""
-        head = self._LAYOUT.pack(self.burst, self.frame, self.chunk, len(self.ranges))
+        """Write the body."""
+        head = self.LAYOUT.pack(self.burst, self.frame, self.chunk, len(self.ranges))
         return head + b"".join(self._RANGE.pack(a, b - a) for a, b in self.ranges)
 
     @classmethod
     def unpack(cls, body: bytes) -> Self:
-        """Read the body."""
-        burst, frame, chunk, count = _unpack(cls._LAYOUT, body, "READ")
-        if len(body) < cls._LAYOUT.size + count * cls._RANGE.size:
-            raise MalformedError(f"READ: expected {count} ranges, got {len(body)} bytes")
-        rows = [cls._RANGE.unpack_from(body, cls._LAYOUT.size + i * cls._RANGE.size) for i in range(count)]
+        """Read the body; raises MalformedError when it is too short."""
+        burst, frame, chunk, count = cls._numbers(body)
+        rows = cls._rows(body, cls._RANGE, count)
         return cls(burst, frame, chunk, tuple((a, a + n) for a, n in rows))
 
 
-DATA = struct.Struct("<IHI")  # burst, frame, offset; then the whitened bytes
-
-
 @dataclass(frozen=True)
-class Refused:
+class Refused(Body):
     """REFUSED: why, and a sentence for people."""
 
     reason: int
     text: str
-    _LAYOUT = struct.Struct("<B")
+    LAYOUT = struct.Struct("<B")
 
     def pack(self) -> bytes:
         """Write the body."""
-        return self._LAYOUT.pack(self.reason) + self.text.encode("ascii", "replace")
+        return self.LAYOUT.pack(self.reason) + self.text.encode("ascii", "replace")
 
     @classmethod
     def unpack(cls, body: bytes) -> Self:
-        """Read the body."""
-        (reason,) = _unpack(cls._LAYOUT, body, "REFUSED")
+        """Read the body; raises MalformedError when it is empty."""
+        (reason,) = cls._numbers(body)
         return cls(reason, _text(body[1:]))
+
+
+def _text(data: bytes) -> str:
+    return data.split(b"\0")[0].decode("ascii", errors="replace")

@@ -1,16 +1,25 @@
 """Packets and the parser that finds them in a stream of bytes; no input or output of its own.
 
 A packet is ``header, body, CRC-32``, stuffed by COBS, with a 0x00 on both ends. docs/serial-protocol.md is the reference.
+COBS (Cheshire and Baker, IEEE/ACM Trans. Networking 7(2), 1999) turns any bytes into bytes without 0x00.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 
-from tofcapture.devices.tof_serial import cobs
+from tofcapture.errors import ConfigError
+
+try:
+    from cobs import cobs
+except ImportError as err:
+    raise ConfigError(
+        f"the driver tof_serial needs the Python package cobs: {err}",
+        hint="pip install 'tofcapture[hardware]'",
+    ) from err
 
 PROTOCOL = 1
 HEADER = struct.Struct("<BBHI")  # protocol, kind, sequence number, token
@@ -43,18 +52,8 @@ class Kind(IntEnum):
 class Packet:
     """One packet whose CRC is right.
 
-    Attributes
-    ----------
-    kind
-        A :class:`Kind`, or a number that this version does not know.
-    token
-        Chosen by the host for each request; replies repeat it.
-    body
-        What the kind says.
-    seq
-        The sender's count of packets, modulo 65536.
-    protocol
-        The sender's version.
+    ``kind`` may be a number that this version does not know. ``token`` is chosen by the host for each request, and
+    replies repeat it. ``seq`` counts the sender's packets modulo 65536, ``protocol`` is its version.
     """
 
     kind: int
@@ -69,13 +68,17 @@ def encode(packet: Packet) -> bytes:
     if len(packet.body) > MAX_BODY:
         raise ValueError(f"packet: expected a body of at most {MAX_BODY} bytes, got {len(packet.body)}")
     raw = HEADER.pack(packet.protocol, packet.kind, packet.seq & 0xFFFF, packet.token) + packet.body
-    return b"\0" + cobs.encode(raw + _CRC.pack(zlib.crc32(raw))) + b"\0"
+    stuffed: bytes = cobs.encode(raw + _CRC.pack(zlib.crc32(raw)))
+    return b"\0" + stuffed + b"\0"
 
 
 def decode(piece: bytes | bytearray) -> Packet | None:
     """Read what stood between two delimiters; ``None`` when it is no whole packet."""
-    raw = cobs.decode(piece)
-    if raw is None or not HEADER.size + _CRC.size <= len(raw) <= _MAX_PACKET:
+    try:
+        raw = cobs.decode(piece)
+    except cobs.DecodeError:
+        return None
+    if not HEADER.size + _CRC.size <= len(raw) <= _MAX_PACKET:
         return None
     view = memoryview(raw)
     if zlib.crc32(view[: -_CRC.size]) != _CRC.unpack_from(raw, len(raw) - _CRC.size)[0]:
@@ -84,22 +87,12 @@ def decode(piece: bytes | bytearray) -> Packet | None:
     return Packet(kind, token, raw[HEADER.size : -_CRC.size], seq, protocol)
 
 
-@dataclass
 class Parser:
-    """Finds packets in bytes that arrive in any pieces; after damage it goes on at the next 0x00.
+    """Finds packets in bytes that arrive in any pieces; after damage it goes on at the next 0x00."""
 
-    Attributes
-    ----------
-    packets, damaged, lost
-        Counts: whole packets, pieces that were none, packets that the sender's sequence numbers miss.
-    """
-
-    packets: int = 0
-    damaged: int = 0
-    lost: int = 0
-    _rest: bytearray = field(default_factory=bytearray)
-    _skipping: bool = False
-    _next: int | None = None
+    def __init__(self) -> None:
+        self._rest = bytearray()
+        self._skipping = False  # an endless piece is passed over until the next 0x00
 
     def feed(self, data: bytes) -> list[Packet]:
         """Take bytes, return the packets that they complete; never raises on any input."""
@@ -111,9 +104,9 @@ class Parser:
         self._rest.clear()
         if self._skipping:
             self._skipping, pieces[0] = False, b""
-        found = [p for p in map(self._piece, pieces) if p is not None]
         self._keep(rest)
-        return found
+        found = (decode(piece) for piece in pieces if piece and len(piece) <= _MAX_ENCODED)
+        return [packet for packet in found if packet is not None]
 
     def _keep(self, data: bytes) -> None:
         """Hold the beginning of a packet, but never more than the longest one."""
@@ -123,18 +116,3 @@ class Parser:
         if len(self._rest) > _MAX_ENCODED:
             self._rest.clear()
             self._skipping = True
-            self.damaged += 1
-
-    def _piece(self, piece: bytes) -> Packet | None:
-        if not piece:
-            return None
-        packet = decode(piece) if len(piece) <= _MAX_ENCODED else None
-        if packet is None:
-            self.damaged += 1
-            return None
-        if self._next is not None:
-            gap = (packet.seq - self._next) & 0xFFFF
-            self.lost += gap if gap < 0x8000 else 0
-        self._next = (packet.seq + 1) & 0xFFFF
-        self.packets += 1
-        return packet

@@ -7,20 +7,18 @@ import os
 import select
 import time
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
-from tofcapture.devices.tof_serial.errors import LinkLostError
 from tofcapture.devices.tof_serial.packet import Parser
-from tofcapture.devices.tof_serial.script import Ask, Heard, Script
+from tofcapture.devices.tof_serial.session import Ask, Heard, LinkLostError, Script, T
 from tofcapture.errors import ConfigError
 
-T = TypeVar("T")
 _SLICE = 0.02  # s; the longest that one read of a port without descriptor may block
 _READ = 65536
 
 
 class Port:
-    """An open port and the parser of what comes from it.
+    """A port and the parser of what comes from it; may be opened and closed again and again.
 
     Parameters
     ----------
@@ -32,7 +30,7 @@ class Port:
 
     def __init__(self, url: str, baud: int) -> None:
         self.url, self.baud = url, baud
-        self.parser = Parser()
+        self._parser = Parser()
         self._serial: Any = None
 
     def __enter__(self) -> Self:
@@ -54,7 +52,7 @@ class Port:
                 f"{self.url}: cannot open the port: {err}",
                 hint="ls /dev/serial/by-id; is the user in the group dialout; does another program hold it?",
             ) from err
-        self._serial = port
+        self._serial, self._parser = port, Parser()
         return self
 
     def __exit__(
@@ -99,7 +97,7 @@ class Port:
             self._serial.write(ask.send)
         while (left := ask.until - time.monotonic_ns()) > 0:
             data = self._read(left * 1e-9)
-            packets = self.parser.feed(data) if data else []
+            packets = self._parser.feed(data) if data else []
             if packets:
                 return Heard(time.monotonic_ns(), tuple(packets))
         return Heard(time.monotonic_ns())

@@ -1,31 +1,24 @@
-"""The host's side of the protocol as scripts: generators that say what to send and how long to listen.
+"""The host's side of the protocol, without a port and without a clock.
 
-A script yields :class:`Ask` and is sent :class:`Heard`; it knows no port and no clock, so the same script runs on a serial port,
-on a socket, and in a simulation with a simulated clock::
+Every request is a generator, a *script*: it yields what to send and how long to listen (:class:`Ask`), and is sent what
+came (:class:`Heard`). The same script runs on a serial port, on a socket, and in a simulation with a simulated clock::
 
-    info = run(Host().hello(), port)       # tofcapture.devices.tof_serial.port
+    info = port.run(Session().hello())       # tofcapture.devices.tof_serial.port
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices.tof_serial.assembly import Assembly
 from tofcapture.devices.tof_serial.clock import Anchor, anchor
-from tofcapture.devices.tof_serial.errors import (
-    FirmwareError,
-    LinkTooBadError,
-    ModuleRefusedError,
-    ModuleResetError,
-    ModuleSilentError,
-)
 from tofcapture.devices.tof_serial.messages import (
     DATA,
+    BurstState,
     Capture,
     Frame,
     FrameKey,
@@ -35,34 +28,80 @@ from tofcapture.devices.tof_serial.messages import (
     Read,
     Reason,
     Refused,
-    State,
     Time,
 )
 from tofcapture.devices.tof_serial.packet import PROTOCOL, Kind, Packet, encode
-from tofcapture.devices.tof_serial.script import MS, NOW, Ask, Heard, Script, Timing
+from tofcapture.devices.tof_serial.pixels import Assembly
+from tofcapture.errors import DeviceError
 
+MS = 1_000_000  # ns
+_REPLY = 200 * MS  # wait for the answer to a short request
+_GAP = 250 * MS  # wait between two chunks of the largest size
+_TRIES = 10  # of each short request
 _SMALLEST_CHUNK = 128
 _RANGES = 16  # per READ, so that a request is short enough to survive a bad link
 _STALLED = 12  # rounds in a row without one new byte
 _PINGS = 8
 _MATCH = {Kind.HELLO: Kind.INFO, Kind.SYNC: Kind.TIME, Kind.META: Kind.FRAME}
 
-Body = TypeVar("Body")
+T = TypeVar("T")
+
+
+class LinkLostError(DeviceError):
+    """The port is gone: a pulled cable, a module without power, another process on the port."""
+
+
+class ModuleSilentError(DeviceError):
+    """The port is open but nobody answers."""
+
+
+class LinkTooBadError(DeviceError):
+    """The link loses so much that a frame cannot be completed, or answers never arrive."""
+
+
+class ModuleResetError(DeviceError):
+    """The module started anew in the middle of the work; its burst is gone."""
+
+
+class FirmwareError(DeviceError):
+    """The module's firmware or protocol is not one that this host, or this station, works with."""
+
+
+class ModuleRefusedError(DeviceError):
+    """The module says no, or says something that the protocol does not allow."""
+
+
+class ClockError(DeviceError):
+    """The module's clock jumps or drifts beyond what a crystal does."""
+
+
+@dataclass(frozen=True)
+class Ask:
+    """Send these bytes, then listen until packets come or the host clock says ``until`` (ns)."""
+
+    send: bytes
+    until: int
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What came, and the host clock (ns) right after."""
+
+    now: int
+    packets: tuple[Packet, ...] = ()
+
+
+Script = Generator[Ask, Heard, T]
+_NOW = Ask(b"", 0)  # tells the time and sends nothing
 
 
 @dataclass
-class Host:
+class Session:
     """Sends requests and understands replies.
 
-    Parameters
-    ----------
-    timing
-        How long to wait.
-    largest_chunk
-        Bytes of a DATA payload that the host asks for at first; it adapts to the link.
+    The host asks for DATA payloads of ``largest_chunk`` bytes at first, and adapts to the link.
     """
 
-    timing: Timing = field(default_factory=Timing)
     largest_chunk: int = 16384
     chunk: int = 0
     boot: int | None = None
@@ -85,9 +124,7 @@ class Host:
                 _refuse(_read(Refused.unpack, packet))
             yield packet
 
-    def request(
-        self, kind: Kind, body: bytes, unpack: Callable[[bytes], Body]
-    ) -> Script[tuple[int, int, Body]]:
+    def request(self, kind: Kind, body: bytes, unpack: Callable[[bytes], T]) -> Script[tuple[int, int, T]]:
         """Ask until answered; returns (sent_ns, received_ns, answer).
 
         Raises
@@ -100,11 +137,11 @@ class Host:
             The module says no.
         """
         answer, before = _MATCH.get(kind, Kind.STATE), self.heard
-        now = (yield NOW).now
-        for _ in range(self.timing.tries):
+        now = (yield _NOW).now
+        for _ in range(_TRIES):
             # A token per try: a late answer to an earlier one must not be taken for a quick one.
             sent, send = now, self._encode(kind, body)
-            deadline = sent + self.timing.reply
+            deadline = sent + _REPLY
             while now < deadline:
                 heard = yield Ask(send, deadline)
                 now, send = heard.now, b""
@@ -165,7 +202,7 @@ class Host:
             The burst does not become ready.
         """
         body = Capture(burst, frames).pack()
-        _, now, state = yield from self.request(Kind.CAPTURE, body, State.unpack)
+        _, now, state = yield from self.request(Kind.CAPTURE, body, BurstState.unpack)
         deadline = now + 2000 * frames * period_us + 1000 * MS
         while True:
             self._same_boot(state.boot)
@@ -183,21 +220,14 @@ class Host:
             wait = now + min(1000 * period_us, 20 * MS)
             while now < wait:
                 now = (yield Ask(b"", wait)).now
-            _, now, state = yield from self.request(Kind.STATUS, b"", State.unpack)
+            _, now, state = yield from self.request(Kind.STATUS, b"", BurstState.unpack)
 
     def release(self) -> Script[None]:
         """Let the module forget its burst."""
-        yield from self.request(Kind.RELEASE, b"", State.unpack)
+        yield from self.request(Kind.RELEASE, b"", BurstState.unpack)
 
     def frame(self, burst: int, index: int, size: int) -> Script[tuple[Frame, NDArray[np.uint8]]]:
-        """Upload one frame; missing chunks are asked for again, in smaller pieces where the link is bad.
-
-        Parameters
-        ----------
-        burst, index
-            Which.
-        size
-            Bytes that it must have.
+        """Upload a frame of ``size`` bytes; missing chunks are asked for again, in smaller pieces where the link is bad.
 
         Raises
         ------
@@ -246,9 +276,9 @@ class Host:
 
     def _round(self, assembly: Assembly, read: Read) -> Script[int]:
         """One READ and what comes of it; returns the number of new bytes."""
-        now = (yield NOW).now
+        now = (yield _NOW).now
         send, got = self._encode(Kind.READ, read.pack()), 0
-        gap = self.timing.reply // 4 + self.timing.gap * self.chunk // self.largest_chunk
+        gap = _REPLY // 4 + _GAP * self.chunk // self.largest_chunk
         deadline = now + gap
         while now < deadline:
             heard = yield Ask(send, deadline)
@@ -274,7 +304,7 @@ def _lay(assembly: Assembly, read: Read, packet: Packet) -> int:
     return assembly.put(offset, memoryview(packet.body)[DATA.size :])
 
 
-def _read(unpack: Callable[[bytes], Body], packet: Packet) -> Body:
+def _read(unpack: Callable[[bytes], T], packet: Packet) -> T:
     try:
         return unpack(packet.body)
     except MalformedError as err:

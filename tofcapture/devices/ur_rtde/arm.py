@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from tofcapture.devices import Arm
 from tofcapture.devices.clearance import stage_of
 from tofcapture.devices.faults import ArmFault, NotReady
 from tofcapture.devices.kinematics import forward
+from tofcapture.devices.ur_rtde.limits import check_goal, check_way, read_settings
 from tofcapture.devices.ur_rtde.link import Link, Sample
 from tofcapture.devices.ur_rtde.motion import ARRIVED, duration, follow, settle
 from tofcapture.devices.ur_rtde.probe import Controller, probe
-from tofcapture.devices.ur_rtde.settings import read_settings
-from tofcapture.devices.ur_rtde.way import check_goal, check_way
 from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.frames import ArmInfo, ArmState
 from tofcapture.poses import Float64, invert, rotation_angle, rotation_exp, transform
@@ -31,18 +31,16 @@ _MODEL_ERROR = (0.01, np.radians(1.5))  # m, rad; calibrated arms differ from no
 _PARENT = (2.0, 10.0)  # s of the station's silence that stop a motion, and an idle arm
 
 
-class UrArm:
+class UrArm(Arm):
     """A UR arm behind ``ur_rtde``.
 
     Parameters
     ----------
     table
-        See :class:`settings.Settings`.
+        See :class:`limits.Settings`.
     context
         The station; says whether motion is allowed, and where things stand.
     """
-
-    simulated = False
 
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
         self._settings = read_settings(table)
@@ -57,8 +55,13 @@ class UrArm:
         self._fault: ArmFault | None = None
 
     def describe(self) -> ArmInfo:
-        """Model, and the serial number or the address of the station file."""
+        """Name the model, and the serial number or the address of the station file."""
         return ArmInfo(self._settings.model.name, self._settings.serial or self._settings.host)
+
+    def probe(self) -> str:
+        """Ask the controller who and how it is; see :func:`probe.probe`. Nothing is sent that moves."""
+        there = probe(self._settings)
+        return f"PolyScope {'.'.join(map(str, there.version))}, arm {there.serial or 'unknown'} is ready"
 
     def __enter__(self) -> Self:
         """Probe, connect, check that this is the arm it should be. Nothing moves.
@@ -82,6 +85,7 @@ class UrArm:
         return self
 
     def _prepare(self, link: Link) -> None:
+        """Wait for the script, learn the TCP, check the model, and set the watchdog."""
         link.started()
         self._T_flange_tcp = self._tcp()
         sample = link.fresh()
@@ -149,18 +153,7 @@ class UrArm:
         self._stop.set()
 
     def watch(self, silence: float) -> None:
-        """Look after link, safety and script; called a few times a second from another thread.
-
-        Parameters
-        ----------
-        silence
-            Seconds since the station gave a sign of life.
-
-        Raises
-        ------
-        ArmFault
-            What is wrong.
-        """
+        """Look after link, safety and script; stop a motion when the station has fallen silent. See :class:`Device`."""
         self._silence = silence
         link = self._link
         if link is None or self._closed.is_set():

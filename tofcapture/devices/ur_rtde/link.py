@@ -16,15 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from tofcapture.devices.faults import (
-    ArmFault,
-    ControllerSilent,
-    LinkLost,
-    NotReady,
-    ProgramStopped,
-    StaleData,
-)
-from tofcapture.devices.ur_rtde.safety import PLAYING, danger, halted
+from tofcapture.devices import faults
+from tofcapture.devices.ur_rtde.wire import PLAYING, danger, halted
 from tofcapture.errors import ConfigError
 from tofcapture.poses import Float64
 
@@ -87,35 +80,23 @@ class Link:
         self._receive, self._control = _connect(host, [*_VARIABLES, *(["speed_scaling"] if scaling else [])])
 
     def command(self, name: str, limit: float, *args: Any) -> Any:
-        """Call a method of the control interface; :meth:`overdue` tells when it takes longer than ``limit`` seconds."""
+        """Call a method of the control interface; :meth:`overdue` tells when it takes more than ``limit`` seconds."""
         with self._lock:
             self._busy = (name, time.monotonic() + limit)
             try:
                 return getattr(self._control, name)(*args)
             except (RuntimeError, ValueError) as err:
-                raise ControllerSilent(f"{self._host}: {name}: {err}") from err
+                raise faults.ControllerSilent(f"{self._host}: {name}: {err}") from err
             finally:
                 self._busy = None
 
     def kick(self) -> None:
-        """Feed the watchdog, unless a command does so just now.
-
-        Raises
-        ------
-        ArmFault
-            The controller refuses.
-        """
+        """Feed the watchdog, unless a command does so just now; raises faults.ArmFault when the controller refuses."""
         if not self._lock.locked() and not self.command("kickWatchdog", 3.0):
             raise self.reason("kickWatchdog")
 
     def kick_seeing(self) -> None:
-        """Feed the watchdog of a moving arm: only while its data are new, else it shall stop.
-
-        Raises
-        ------
-        ArmFault
-            The controller refuses.
-        """
+        """Feed the watchdog of a moving arm: only while its data are new, else it shall stop."""
         if self.seeing and not self.command("kickWatchdog", 3.0):
             raise self.reason("kickWatchdog")
 
@@ -125,35 +106,35 @@ class Link:
         while not self.playing and time.monotonic() < end:
             time.sleep(0.005)
 
-    def overdue(self) -> ArmFault | None:
+    def overdue(self) -> faults.ArmFault | None:
         """The command that runs too long, if there is one."""
         busy = self._busy
         if busy is None or time.monotonic() < busy[1]:
             return None
-        return ControllerSilent(f"{self._host}: {busy[0]} is not answered")
+        return faults.ControllerSilent(f"{self._host}: {busy[0]} is not answered")
 
-    def trouble(self) -> ArmFault | None:
-        """What is wrong now: link, age of the data, safety, script."""
+    def trouble(self) -> faults.ArmFault | None:
+        """Find what is wrong now: link, age of the data, safety, script."""
         stamp = self._receive.getTimestamp()
         now = time.monotonic()
         if stamp != self._newest:
             self._newest, self._seen = stamp, now
         if not self._receive.isConnected():
-            return LinkLost(f"{self._host}: the connection broke")
+            return faults.LinkLost(f"{self._host}: the connection broke")
         if now - self._seen > _STALE:
-            return StaleData(f"{self._host}: no newer data for {now - self._seen:.1f} s")
+            return faults.StaleData(f"{self._host}: no newer data for {now - self._seen:.1f} s")
         return danger(self._receive.getSafetyStatusBits(), self._receive.getRobotMode()) or halted(
             self._receive.getRuntimeState()
         )
 
-    def reason(self, refused: str) -> ArmFault:
-        """Why a command was refused: the state that shows within half a second."""
+    def reason(self, refused: str) -> faults.ArmFault:
+        """Find why a command was refused: the state that shows within half a second."""
         end = time.monotonic() + _REASON
         while time.monotonic() < end:
             if (fault := self.trouble()) is not None:
                 return fault
             time.sleep(0.01)
-        return ProgramStopped(f"{self._host}: the controller refused {refused} and gives no reason")
+        return faults.ProgramStopped(f"{self._host}: the controller refused {refused} and gives no reason")
 
     def sample(self) -> Sample:
         """Read what the controller says, after making sure that it may be believed.
@@ -166,14 +147,12 @@ class Link:
         if (fault := self.trouble()) is not None:
             raise fault
         receive = self._receive
-        stamp, scaling = (
-            float(receive.getTimestamp()),
-            float(receive.getSpeedScaling()) if self._scaling else 1.0,
-        )
+        stamp = float(receive.getTimestamp())
+        scaling = float(receive.getSpeedScaling()) if self._scaling else 1.0
         joints, speeds = _array(receive.getActualQ()), _array(receive.getActualQd())
         pose = _array(receive.getActualTCPPose())
         if not all(a.shape == (6,) and np.isfinite(a).all() for a in (joints, speeds, pose)):
-            raise StaleData(f"{self._host}: the measured joints are no numbers: {joints.tolist()}")
+            raise faults.StaleData(f"{self._host}: the measured joints are no numbers: {joints.tolist()}")
         # A controller at rest may say 0: the slider is not at zero while a program plays.
         return Sample(stamp, joints, speeds, pose, scaling if 0.01 <= scaling <= 1 else 1.0)
 
@@ -226,18 +205,18 @@ def _connect(host: str, variables: list[str]) -> tuple[Any, Any]:
     return receive, control
 
 
-def _translated(host: str, text: str) -> ArmFault:
+def _translated(host: str, text: str) -> faults.ArmFault:
     """The library's sentences, as states."""
     if "already in use" in text:
-        return NotReady(
+        return faults.NotReady(
             f"{host}: another client commands the controller: {text}",
             hint="stop the other program; disable EtherNet/IP, PROFINET and Modbus if they hold registers",
         )
     if "remote control" in text:
-        return NotReady(f"{host}: the controller is in local control")
+        return faults.NotReady(f"{host}: the controller is in local control")
     if "control script" in text:
-        return ProgramStopped(f"{host}: {text}")
-    return ControllerSilent(f"{host}: {text}")
+        return faults.ProgramStopped(f"{host}: {text}")
+    return faults.ControllerSilent(f"{host}: {text}")
 
 
 def _array(values: Sequence[float]) -> Float64:

@@ -17,28 +17,14 @@ ARRIVED = np.radians(0.02)
 _POLL = 0.02  # s
 _READINGS = 3  # at the goal
 _WINDOW = 0.2  # s over which the arm must be at rest
-_AT_REST = (1e-3, 1e-4, np.radians(0.02))  # rad/s of any joint; m of the flange; rad of any joint
+_STILL = (1e-3, 1e-4, np.radians(0.02))  # rad/s of any joint; m of the flange; rad of any joint
 _SETTLING = 3.0  # s
 
 
 def follow(link: Link, goal: Float64, seconds: float, stop: threading.Event) -> bool:
-    """Wait until the arm is at its goal.
+    """Wait until the arm is at its goal (6,) rad; returns False when ``stop`` ended the wait.
 
-    Parameters
-    ----------
-    link
-        The controller.
-    goal
-        (6,) rad.
-    seconds
-        Planned duration at full speed; half as much again and 2 s are granted, longer when the speed slider is low.
-    stop
-        Ends the wait.
-
-    Returns
-    -------
-    bool
-        False when ``stop`` ended it.
+    Half as much again as the planned ``seconds`` and 2 s are granted, longer when the speed slider is low.
 
     Raises
     ------
@@ -64,12 +50,7 @@ def follow(link: Link, goal: Float64, seconds: float, stop: threading.Event) -> 
 
 
 def settle(link: Link, ringing: float) -> Sample:
-    """Wait until joints and flange are at rest, then ``ringing`` seconds for the structure.
-
-    Returns
-    -------
-    Sample
-        Measured after all that.
+    """Wait until joints and flange are at rest, then ``ringing`` seconds; returns what is measured after that.
 
     Raises
     ------
@@ -80,7 +61,7 @@ def settle(link: Link, ringing: float) -> Sample:
     """
     window: deque[Sample] = deque([link.fresh()])
     end = time.monotonic() + _SETTLING
-    while not at_rest(window):
+    while not _at_rest(window):
         if time.monotonic() > end:
             raise NotSettled(
                 f"the arm did not come to rest within {_SETTLING:.0f} s",
@@ -94,7 +75,7 @@ def settle(link: Link, ringing: float) -> Sample:
     return link.fresh()
 
 
-def at_rest(samples: Sequence[Sample]) -> bool:
+def _at_rest(samples: Sequence[Sample]) -> bool:
     """Tell whether speeds of the joints and spread of the flange are those of an arm at rest, for 0.2 s at least."""
     if len(samples) < _READINGS or samples[-1].timestamp - samples[0].timestamp < _WINDOW:
         return False
@@ -102,14 +83,14 @@ def at_rest(samples: Sequence[Sample]) -> bool:
     places = np.stack([s.pose[:3] for s in samples])
     joints = np.stack([s.joints for s in samples])
     return (
-        speed < _AT_REST[0]
-        and float(np.linalg.norm(np.ptp(places, axis=0))) < _AT_REST[1]
-        and float(np.ptp(joints, axis=0).max()) < _AT_REST[2]
+        speed < _STILL[0]
+        and float(np.linalg.norm(np.ptp(places, axis=0))) < _STILL[1]
+        and float(np.ptp(joints, axis=0).max()) < _STILL[2]
     )
 
 
 def duration(way: Float64, speed: float, acceleration: float) -> float:
-    """Seconds of a trapezoidal move by (6,) rad at ``speed`` rad/s and ``acceleration`` rad/s^2 of the longest joint."""
+    """Tell the seconds of a trapezoidal move by (6,) rad at ``speed`` rad/s and ``acceleration`` rad/s^2 of the longest joint."""
     length = float(np.abs(way).max())
     ramp = speed / acceleration
     if length < speed * ramp:

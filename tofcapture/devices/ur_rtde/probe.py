@@ -17,8 +17,7 @@ from typing import Self, TextIO
 
 from tofcapture.devices.faults import ControllerSilent, NotReady, StaleData
 from tofcapture.devices.ur_rtde import wire
-from tofcapture.devices.ur_rtde.safety import danger
-from tofcapture.devices.ur_rtde.settings import Settings
+from tofcapture.devices.ur_rtde.limits import Settings
 
 DASHBOARD = 29999
 _TIMEOUT = 2.0  # s for each answer
@@ -75,7 +74,7 @@ def probe(settings: Settings) -> Controller:
         first, second = rtde.two_samples()
     if not second["timestamp"] > first["timestamp"]:  # type: ignore[operator]
         raise StaleData(f"{settings.host}: the controller's clock stands still at {second['timestamp']} s")
-    fault = danger(int(second["safety_status_bits"]), int(second["robot_mode"]))  # type: ignore[arg-type]
+    fault = wire.danger(int(second["safety_status_bits"]), int(second["robot_mode"]))  # type: ignore[arg-type]
     if fault is not None:
         raise fault
     serial = _dashboard(settings)

@@ -17,8 +17,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from tofcapture.devices import Operator
 from tofcapture.errors import BusyError, DeviceError, MotionRefused, TofError
-from tofcapture.frames import Truth, View
+from tofcapture.frames import View
 from tofcapture.record.watch import DiskFull, Stopped, Watch
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ class Link:
             threading.Event().wait(ALIVE)
 
 
-class PageOperator:
+class PageOperator(Operator):
     """The person at the page, who puts scenes on the table when asked."""
 
     def __init__(self, link: Link) -> None:
@@ -124,10 +125,6 @@ class PageOperator:
     def place(self, scene: str) -> None:
         """Ask and wait."""
         self._link.ask(scene)
-
-    def truth(self) -> Truth | None:
-        """Nobody knows the real world exactly."""
-        return None
 
 
 class Reporter(Watch):
@@ -190,8 +187,7 @@ def _work(job: Mapping[str, Any], link: Link) -> dict[str, Any]:
                 hint="look at record --dry-run, clear the workspace, then start the daemon with --allow-motion",
             )
         link.tell("opened", station=station.describe(), simulated=station.simulated)
-        asks = station.config.get("operator", {}).get("driver") == "console"
-        staffed = replace(station, operator=PageOperator(link)) if asks else station
+        staffed = replace(station, operator=PageOperator(link)) if station.operator.person else station
         watch = Reporter(link, Path(job["previews"]))
         result = record(
             staffed, job["scene"], Path(job["recording"]), job["views"], job["frames"], watch=watch

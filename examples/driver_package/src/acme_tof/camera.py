@@ -1,4 +1,4 @@
-"""The driver itself: a plain class that inherits nothing."""
+"""The driver itself: a class with the protocol of a ToF camera."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from tofcapture.camera import Camera
+from tofcapture.devices import TofCamera
 from tofcapture.devices.registry import StationContext
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.frames import TofBurst, TofInfo
@@ -21,7 +22,7 @@ _MEANING = {
 }
 
 
-class AcmeTof:
+class AcmeTof(TofCamera):
     """A ToF camera.
 
     Parameters

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.devices.tof_serial.messages import Info
+from tofcapture.devices.tof_serial.pixels import whiten
 from tofcapture.rig import SPEED_OF_LIGHT
 
 Source = Callable[[int, int], tuple[NDArray[np.uint16], float]]
@@ -56,3 +57,10 @@ def synthetic(info: Info, seed: int) -> Source:
         return np.clip(np.rint(noisy), 0, 4095).astype(np.uint16), round(45 + 0.1 * index, 2)
 
     return frame
+
+
+def whitened(data: bytes, offset: int = 0) -> bytes:
+    """Whiten a copy of bytes that begin at ``offset`` of their frame."""
+    out = np.frombuffer(data, dtype=np.uint8).copy()
+    whiten(out, offset)
+    return out.tobytes()

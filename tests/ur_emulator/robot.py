@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from tests.ur_emulator.faults import Faults
+from tests.ur_emulator.motion import Motion
 from tofcapture.devices.kinematics import HOME, arm_model, forward
 from tofcapture.devices.ur_rtde.wire import Value
 from tofcapture.poses import rotation_log
-from tofcapture.testing.ur_emulator.faults import Faults
-from tofcapture.testing.ur_emulator.motion import Motion
 
 STOPPED, PLAYING, PAUSED = 1, 2, 4  # runtime_state
 NORMAL, PROTECTIVE, EMERGENCY = 1, 3, 7  # safety_mode; 7 is the robot's own emergency stop

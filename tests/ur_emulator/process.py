@@ -9,11 +9,13 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from tofcapture.errors import DeviceError
 
+_ROOT = Path(__file__).parents[2]
 _used = itertools.count(2)
 
 
@@ -41,18 +43,10 @@ class Emulator:
         self._control: socket.socket | None = None
 
     def __enter__(self) -> Self:
-        command = [
-            sys.executable,
-            "-m",
-            "tofcapture.testing.ur_emulator",
-            "--host",
-            self.host,
-            "--model",
-            self._model,
-        ]
+        command = [sys.executable, "-m", "tests.ur_emulator", "--host", self.host, "--model", self._model]
         # It ends when its standard input closes: also when this process is killed.
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0, cwd=_ROOT
         )
         assert self._process.stdout is not None
         line = self._process.stdout.readline()

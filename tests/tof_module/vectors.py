@@ -1,4 +1,4 @@
-"""Test vectors for firmware authors: ``python -m tofcapture.devices.tof_serial.vectors > docs/serial-vectors.json``."""
+"""Test vectors for firmware authors: ``python -m tests.tof_module.vectors > docs/serial-vectors.json``."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import zlib
 from typing import Any
 
 import numpy as np
+from cobs import cobs
 
-from tofcapture.devices.tof_serial import cobs
+from tests.tof_module.synthetic import simulated_info, whitened
 from tofcapture.devices.tof_serial.messages import (
     DATA,
+    BurstState,
     Capture,
     Frame,
     FrameKey,
@@ -18,12 +20,10 @@ from tofcapture.devices.tof_serial.messages import (
     Read,
     Reason,
     Refused,
-    State,
     Time,
 )
 from tofcapture.devices.tof_serial.packet import Kind, Packet, encode
-from tofcapture.devices.tof_serial.packing import pack12, whiten
-from tofcapture.devices.tof_serial.synthetic import simulated_info
+from tofcapture.devices.tof_serial.pixels import pack12
 
 
 def _cobs() -> list[dict[str, str]]:
@@ -37,16 +37,20 @@ def _pixels() -> list[dict[str, Any]]:
     out = []
     for row in rows:
         packed = pack12(np.array(row, dtype=np.uint16))
-        white = whiten(np.frombuffer(packed, dtype=np.uint8)).tobytes()
         out.append(
-            {"values": row, "packed": packed.hex(), "crc32": zlib.crc32(packed), "whitened": white.hex()}
+            {
+                "values": row,
+                "packed": packed.hex(),
+                "crc32": zlib.crc32(packed),
+                "whitened": whitened(packed).hex(),
+            }
         )
     return out
 
 
 def _bodies() -> list[tuple[Kind, str, bytes]]:
     info = simulated_info(boot=0x12345678)
-    chunk = whiten(np.arange(16, dtype=np.uint8), 256).tobytes()
+    chunk = whitened(bytes(range(16)), 256)
     return [
         (Kind.HELLO, "empty", b""),
         (Kind.INFO, repr(info), info.pack()),
@@ -54,7 +58,11 @@ def _bodies() -> list[tuple[Kind, str, bytes]]:
         (Kind.TIME, "boot 0x12345678, clock 1234567890123 us", Time(0x12345678, 1234567890123).pack()),
         (Kind.CAPTURE, "burst 77, 10 frames", Capture(77, 10).pack()),
         (Kind.STATUS, "empty", b""),
-        (Kind.STATE, "burst 77, exposing, 4 frames done", State(0x12345678, 77, Progress.EXPOSING, 4).pack()),
+        (
+            Kind.STATE,
+            "burst 77, exposing, 4 frames done",
+            BurstState(0x12345678, 77, Progress.EXPOSING, 4).pack(),
+        ),
         (Kind.META, "burst 77, frame 3", FrameKey(77, 3).pack()),
         (
             Kind.FRAME,
@@ -89,7 +97,7 @@ def _packets() -> list[dict[str, Any]]:
 
 def vectors() -> dict[str, Any]:
     """All test vectors as JSON types; bytes are hexadecimal."""
-    key = whiten(np.zeros(300, dtype=np.uint8)).tobytes()
+    key = whitened(bytes(300))
     return {
         "format": "tofcapture-serial-vectors",
         "version": 1,

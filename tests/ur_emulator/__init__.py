@@ -2,7 +2,7 @@
 
 ::
 
-    python -m tofcapture.testing.ur_emulator --host 127.0.0.2
+    python -m tests.ur_emulator --host 127.0.0.2
 
 It listens on loopback addresses only. The ``ur_rtde`` client library has fixed ports, so that several emulators stand on
 several addresses: 127.0.0.2, 127.0.0.3 ... It knows nothing of URScript: a program whose text mentions ``rtde_control`` is

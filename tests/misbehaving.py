@@ -10,12 +10,12 @@ import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from tofcapture.camera import Camera
+from tofcapture.devices import Arm, TofCamera
 from tofcapture.errors import DeviceError, MotionRefused
 from tofcapture.frames import ArmInfo, ArmState, TofBurst, TofInfo
 from tofcapture.poses import Float64
@@ -53,7 +53,7 @@ def misbehave(how: str) -> None:
         os._exit(4)
 
 
-class Camera17:
+class Camera17(TofCamera):
     """A ToF camera that misbehaves.
 
     Parameters
@@ -77,11 +77,6 @@ class Camera17:
         misbehave(self._table.get("open", ""))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
-
     def capture(self, frames: int) -> TofBurst:
         """Take a burst, or not."""
         once = Path(self._table["once"]) if "once" in self._table else None
@@ -93,7 +88,7 @@ class Camera17:
         return TofBurst(raw, np.arange(frames), np.full(frames, np.nan), self.describe())
 
 
-class Arm17:
+class Arm17(Arm):
     """An arm that takes long, can be interrupted, and misbehaves.
 
     Parameters
@@ -115,14 +110,6 @@ class Arm17:
     def describe(self) -> ArmInfo:
         """Say what this arm is."""
         return ArmInfo("ur10e", "17")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
 
     def state(self) -> ArmState:
         """Say where it was sent."""

@@ -9,9 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tests.tof_module.synthetic import Source, whitened
 from tofcapture.devices.tof_serial.messages import (
     CELSIUS_UNKNOWN,
     DATA,
+    BurstState,
     Capture,
     Frame,
     FrameKey,
@@ -21,12 +23,10 @@ from tofcapture.devices.tof_serial.messages import (
     Read,
     Reason,
     Refused,
-    State,
     Time,
 )
 from tofcapture.devices.tof_serial.packet import PROTOCOL, Kind, Packet, Parser, encode
-from tofcapture.devices.tof_serial.packing import pack12, whiten
-from tofcapture.devices.tof_serial.synthetic import Source
+from tofcapture.devices.tof_serial.pixels import pack12
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class _RefusalError(Exception):
 
 
 class ModuleCore:
-    """A module: bytes in, bytes out.
+    """A module: bytes in, bytes out; ``exposed`` counts its bursts.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class ModuleCore:
         self._replies: deque[bytes] = deque()
         self._upload: Iterator[bytes] = iter(())
         self._burst: _Burst | None = None
-        self._bursts = self._seq = self._birth_us = 0
+        self.exposed = self._seq = self._birth_us = 0
         self._packed: dict[int, tuple[bytes, Frame]] = {}
 
     def receive(self, data: bytes, now_us: int) -> None:
@@ -147,20 +147,20 @@ class ModuleCore:
             )
         if self._burst is not None and self._done(clock) < self._burst.frames:
             raise _RefusalError(Reason.BUSY, f"burst {self._burst.number} is being exposed")
-        self._burst = _Burst(ask.burst, self._bursts, ask.frames, clock)
-        self._bursts += 1
+        self._burst = _Burst(ask.burst, self.exposed, ask.frames, clock)
+        self.exposed += 1
         self._packed.clear()
 
     def _done(self, clock: int) -> int:
         assert self._burst is not None
         return min((clock - self._burst.start_us) // self.info.period_us, self._burst.frames)
 
-    def _state(self, clock: int) -> State:
+    def _state(self, clock: int) -> BurstState:
         if self._burst is None:
-            return State(self.info.boot, 0, Progress.NONE, 0)
+            return BurstState(self.info.boot, 0, Progress.NONE, 0)
         done = self._done(clock)
         progress = Progress.READY if done == self._burst.frames else Progress.EXPOSING
-        return State(self.info.boot, self._burst.number, progress, done)
+        return BurstState(self.info.boot, self._burst.number, progress, done)
 
     def _frame(self, burst: int, frame: int, clock: int) -> tuple[bytes, Frame]:
         if self._burst is None or self._burst.number != burst:
@@ -178,7 +178,7 @@ class ModuleCore:
         start = burst.start_us + frame * self.info.period_us
         full = int((raw >= 2**self.info.bits - 1).sum())
         meta = Frame(burst.number, frame, len(data), zlib.crc32(data), start, centi, full)
-        return whiten(np.frombuffer(data, dtype=np.uint8)).tobytes(), meta
+        return whitened(data), meta
 
     def _chunks(self, read: Read, token: int, clock: int) -> Iterator[bytes]:
         data, meta = self._frame(read.burst, read.frame, clock)

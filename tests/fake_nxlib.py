@@ -103,10 +103,10 @@ class FakeNxLib:
         def guarded(body: Callable[..., Any]) -> Callable[..., Any]:
             def function(code: Any, *arguments: Any) -> Any:
                 try:
-                    code._obj.value = 0  # noqa: SLF001  this is how ctypes hands out what byref points to
+                    code._obj.value = 0
                     return body(*arguments)
                 except _CodeError as err:
-                    code._obj.value = err.code  # noqa: SLF001
+                    code._obj.value = err.code
                     return 0
 
             return function
@@ -223,12 +223,12 @@ class FakeNxLib:
         H, W, C = data.shape
         values = (W, H, C, data.itemsize, int(data.dtype.kind == "f"), 13_400_000_000.0)
         for target, value in zip(out, values, strict=True):
-            target._obj.value = value  # noqa: SLF001
+            target._obj.value = value
 
     def _binary(self, path: bytes, buffer: Any, size: int, copied: Any, stamp: Any) -> None:
         data = np.ascontiguousarray(self._at(path))
         ctypes.memmove(buffer, data.ctypes.data, min(size, data.nbytes))
-        copied._obj.value, stamp._obj.value = data.nbytes, 13_400_000_000.0  # noqa: SLF001
+        copied._obj.value, stamp._obj.value = data.nbytes, 13_400_000_000.0
 
 
 class _CodeError(Exception):
@@ -249,11 +249,11 @@ def installed(library: FakeNxLib) -> Iterator[FakeNxLib]:
     """Put a fake in the place of the shared library, and take it out before nxlib would unload it."""
     from nxlib import api
 
-    before = api._nxlib  # noqa: SLF001  the package has no other seam
-    api._nxlib = api._Nxlib()  # noqa: SLF001
-    api._nxlib.lib_object = library  # noqa: SLF001
+    before = api._nxlib
+    api._nxlib = api._Nxlib()
+    api._nxlib.lib_object = library
     try:
         yield library
     finally:
-        api._nxlib.lib_object = None  # noqa: SLF001
-        api._nxlib = before  # noqa: SLF001
+        api._nxlib.lib_object = None
+        api._nxlib = before

@@ -1,4 +1,4 @@
-"""Run an emulator: ``python -m tofcapture.testing.ur_emulator --host 127.0.0.2``."""
+"""Run an emulator: ``python -m tests.ur_emulator --host 127.0.0.2``."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import sys
 import time
 from collections.abc import Awaitable, Callable
 
-from tofcapture.testing.ur_emulator.faults import Faults
-from tofcapture.testing.ur_emulator.lines import ControlPort, Dashboard, ScriptPort
-from tofcapture.testing.ur_emulator.robot import Robot
-from tofcapture.testing.ur_emulator.rtde_server import RtdeServer
+from tests.ur_emulator.faults import Faults
+from tests.ur_emulator.lines import ControlPort, Dashboard, ScriptPort
+from tests.ur_emulator.robot import Robot
+from tests.ur_emulator.rtde_server import RtdeServer
 
 CONTROL = 30020
 _SLOW, _FAST = 0.004, 0.002  # s between cycles
@@ -25,7 +25,7 @@ Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 def parser() -> argparse.ArgumentParser:
     """Options of the program."""
-    out = argparse.ArgumentParser(prog="python -m tofcapture.testing.ur_emulator", description=__doc__)
+    out = argparse.ArgumentParser(prog="python -m tests.ur_emulator", description=__doc__)
     out.add_argument("--host", default="127.0.0.1", help="loopback address to listen on (default 127.0.0.1)")
     out.add_argument(
         "--port-offset", type=int, default=0, help="added to every port, for clients other than ur_rtde"

@@ -5,15 +5,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+from tests.ur_emulator.outputs import TYPES, input_type
+from tests.ur_emulator.robot import Robot
 from tofcapture.devices.ur_rtde import wire
 from tofcapture.errors import DeviceError
-from tofcapture.testing.ur_emulator.outputs import TYPES, input_type
-from tofcapture.testing.ur_emulator.robot import Robot
 
 _POLYSCOPE = (5, 11, 1, 108318)
 _RATE = 500.0  # Hz of an e-series controller
+
+
+def pack(recipe: wire.Recipe, values: Sequence[wire.Value]) -> bytes:
+    """Turn values, in the recipe's order, into bytes."""
+    flat: list[float] = []
+    for value in values:
+        flat.extend(value if isinstance(value, tuple) else (value,))
+    return recipe.layout.pack(*flat)
 
 
 class RtdeServer:
@@ -129,7 +137,7 @@ class _Client:
     def _write_registers(self, payload: bytes) -> None:
         """Take values in; a package of the wrong size is dropped, as the controller drops it."""
         recipe = self._recipes.get(payload[0] if payload else 0)
-        if recipe is None or len(payload) != recipe.size + 1:
+        if recipe is None or len(payload) != recipe.layout.size + 1:
             return
         for name, value in recipe.unpack(payload[1:]).items():
             number = name.rpartition("_")[2]
@@ -147,7 +155,7 @@ class _Client:
             return
         self._next = max(self._next + 1 / self.rate, self._robot.now - 0.1)
         values = [self._value(name) for name in self._outputs.names]
-        self._writer.write(wire.package(wire.DATA, b"\x01" + self._outputs.pack(values)))
+        self._writer.write(wire.package(wire.DATA, b"\x01" + pack(self._outputs, values)))
 
     def _value(self, name: str) -> wire.Value:
         value = self._robot.output(name)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from tofcapture.testing.ur_emulator.robot import Program, Robot
+from tests.ur_emulator.robot import Program, Robot
 
 _READY, _DONE = 1, 2
 _EVERY_CYCLE = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, *range(66, 72)}

@@ -2,8 +2,8 @@
 
 ::
 
-    python -m tofcapture.devices.tof_serial.module --link /tmp/tof0
-    python -m tofcapture.devices.tof_serial.module --tcp 7000         # port = "socket://127.0.0.1:7000"
+    python -m tests.tof_module --link /tmp/tof0
+    python -m tests.tof_module --tcp 7000         # port = "socket://127.0.0.1:7000"
 
 Prints one line, the port to open, then runs until it is ended.
 """
@@ -20,16 +20,71 @@ import time
 import tty
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from tofcapture.devices.tof_serial.core import ModuleCore
-from tofcapture.devices.tof_serial.noise import Noise
+from tests.tof_module.core import ModuleCore
+from tests.tof_module.synthetic import simulated_info, synthetic
 from tofcapture.devices.tof_serial.packet import PROTOCOL
-from tofcapture.devices.tof_serial.synthetic import simulated_info, synthetic
 
 _IDLE = 0.05  # s between looks at the clock while nothing comes
+
+
+@dataclass
+class Noise:
+    """Damages pieces of a stream.
+
+    Attributes
+    ----------
+    rng
+        Source of damage.
+    drop, flip, duplicate, insert
+        Chance of each byte to vanish, to have bits flipped, to come twice, to be followed by a random one.
+    truncate
+        Chance of each byte that it and the rest of its piece never arrive.
+    """
+
+    rng: np.random.Generator
+    drop: float = 0.0
+    flip: float = 0.0
+    duplicate: float = 0.0
+    insert: float = 0.0
+    truncate: float = 0.0
+
+    @classmethod
+    def every(cls, rng: np.random.Generator, rate: float) -> Noise:
+        """All five kinds at the same rate per byte."""
+        return cls(rng, rate, rate, rate, rate, rate)
+
+    def __call__(self, piece: bytes) -> bytes:
+        """Damage one piece, usually a packet."""
+        rates = (self.drop, self.flip, self.duplicate, self.insert, self.truncate)
+        if not piece or not any(rates):
+            return piece
+        # How many bytes are hit is binomial; which ones and how, uniform and by rate.
+        hits = self.rng.binomial(len(piece), min(1.0, sum(rates)))
+        if not hits:
+            return piece
+        out = bytearray(piece)
+        places = np.sort(self.rng.choice(len(piece), hits, replace=False))[::-1]
+        kinds = self.rng.choice(len(rates), hits, p=np.array(rates) / sum(rates))
+        for place, kind in zip(places.tolist(), kinds.tolist(), strict=True):
+            self._hit(out, place, kind)
+        return bytes(out)
+
+    def _hit(self, out: bytearray, place: int, kind: int) -> None:
+        if kind == 0:
+            del out[place]
+        elif kind == 1:
+            out[place] ^= int(self.rng.integers(1, 256))
+        elif kind == 2:
+            out.insert(place, out[place])
+        elif kind == 3:
+            out.insert(place + 1, int(self.rng.integers(256)))
+        else:
+            del out[place:]
 
 
 def clock_us(drift_ppm: float = 0.0) -> Callable[[], int]:
@@ -103,9 +158,7 @@ def open_terminal(link: Path | None = None) -> tuple[int, int, str]:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m tofcapture.devices.tof_serial.module", description=__doc__
-    )
+    parser = argparse.ArgumentParser(prog="python -m tests.tof_module", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--link", type=Path, help="symbolic link to make to the terminal")
     parser.add_argument(
@@ -149,7 +202,3 @@ def _listen(port: int, serve_one: Callable[[int], None]) -> None:
             with connection:
                 connection.setblocking(False)
                 serve_one(connection.fileno())
-
-
-if __name__ == "__main__":
-    main()

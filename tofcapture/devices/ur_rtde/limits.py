@@ -1,4 +1,4 @@
-"""The ``[arm]`` table of a station whose driver is ``ur_rtde``."""
+"""The ``[arm]`` table of the driver ``ur_rtde``, and the checks before every motion that it sets limits to."""
 
 from __future__ import annotations
 
@@ -7,10 +7,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from tofcapture.devices.kinematics import ArmModel, arm_model
-from tofcapture.errors import ConfigError
+from tofcapture.devices.clearance import Stage, body_points, is_clear, straight_way
+from tofcapture.devices.kinematics import ArmModel, arm_model, check_joints
+from tofcapture.devices.registry import check_keys
+from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.poses import Float64
+from tofcapture.rig import Rig
+
+_STEP = np.radians(2.0)  # between checks of the way
+_RADIUS = 0.08  # m; of the arm's links and the rig, by which keep-outs grow
 
 _RANGES = {
     "speed": (0.01, 1.05),
@@ -76,12 +83,7 @@ def read_settings(table: Mapping[str, Any]) -> Settings:
     ConfigError
         Unknown keys, no host, values out of range.
     """
-    known = (*_TEXTS, *_RANGES, "workspace", "keep_out")
-    unknown = table.keys() - set(known)
-    if unknown:
-        raise ConfigError(
-            f"[arm] does not know {', '.join(sorted(unknown))}", hint=f"it knows {', '.join(known)}"
-        )
+    check_keys(table, (*_TEXTS, *_RANGES, "workspace", "keep_out"), "[arm]")
     texts = {key: str(table[key]) for key in _TEXTS if key in table}
     if not texts.get("host"):
         raise ConfigError('[arm] ur_rtde: expected host = "address of the controller"')
@@ -114,3 +116,46 @@ def _boxes(key: str, value: Any) -> Float64:
         )
         raise ConfigError(f"[arm] {key}: expected {what}, got {value!r}")
     return boxes
+
+
+def check_goal(settings: Settings, start: Float64, joints: ArrayLike) -> Float64:
+    """Check that a goal (6,) is sane, and one step away from the measured joints ``start`` at most; radians.
+
+    Raises
+    ------
+    MotionRefused
+        With the joint and the limit.
+    """
+    goal = check_joints(settings.model, joints)
+    turn = np.degrees(np.abs(goal - start))
+    worst = int(turn.argmax())
+    if turn[worst] > settings.max_step_deg:
+        raise MotionRefused(
+            f"move: joint {worst + 1} would turn by {turn[worst]:.0f} deg, allowed are {settings.max_step_deg:.0f}",
+            hint="go by way of home; a joint one turn off its plan must be turned back by hand",
+        )
+    return goal
+
+
+def check_way(settings: Settings, rig: Rig, stage: Stage, start: Float64, goal: Float64) -> None:
+    """Go along the straight way in joint space and look for what is in the way.
+
+    Raises
+    ------
+    MotionRefused
+        Out of the workspace, into a keep-out, or against table, object, base or itself.
+    """
+    links, tools = body_points(settings.model, rig, straight_way(start, goal, _STEP))
+    if settings.workspace is not None:
+        low, high = settings.workspace
+        if ((tools < low) | (tools > high)).any():
+            raise MotionRefused("move: flange or cameras would leave the [arm] workspace")
+    body = np.concatenate([links, tools], axis=1)
+    for number, (low, high) in enumerate(settings.keep_out):
+        if ((body > low - _RADIUS) & (body < high + _RADIUS)).all(axis=-1).any():
+            raise MotionRefused(f"move: the way goes through [arm] keep_out {number + 1}")
+    if not is_clear(settings.model, rig, stage, start, goal):
+        raise MotionRefused(
+            "move: table, object, base or the arm itself is in the way",
+            hint="go by way of home; check table, target and keep_out of [plan]",
+        )

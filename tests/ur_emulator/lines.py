@@ -8,8 +8,8 @@ import json
 import re
 from typing import Any
 
-from tofcapture.testing.ur_emulator.robot import PLAYING, Program, Robot
-from tofcapture.testing.ur_emulator.script import ControlScript
+from tests.ur_emulator.robot import PLAYING, Program, Robot
+from tests.ur_emulator.script import ControlScript
 
 _PROGRAM = re.compile(rb"^def \w+\(\):.*?^end\s*$", re.DOTALL | re.MULTILINE)
 _START = 0.05  # s between a script's last line and its first cycle

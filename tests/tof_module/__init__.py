@@ -1,0 +1,1 @@
+"""A simulated ToF module that speaks docs/serial-protocol.md: for our tests, and to hold other hosts against."""

@@ -1,0 +1,148 @@
+"""What drivers of cameras share: opening anew after an error, and the file of what a camera said of itself."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from tofcapture.devices import Device
+from tofcapture.errors import ConfigError, DeviceError, FormatError
+from tofcapture.files.info import tof_from
+from tofcapture.files.seal import write_text
+from tofcapture.frames import TofInfo
+
+
+class ReopenedCamera(Device):
+    """A camera that is closed after an error and opened anew by the next capture.
+
+    A cable that was plugged in again, or a camera that started again, then needs nothing else.
+    """
+
+    _opened: ExitStack | None = None
+
+    def connect(self, stack: ExitStack) -> None:
+        """Open the parts of the camera; ``stack`` closes them, also when a later part fails."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def open(self) -> None:
+        """Open the camera; one that is open stays as it is."""
+        if self._opened is None:
+            with ExitStack() as stack:
+                self.connect(stack)
+                self._opened = stack.pop_all()
+
+    def close(self) -> None:
+        """Close the camera; again does nothing."""
+        stack, self._opened = self._opened, None
+        if stack is not None:
+            stack.close()
+
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Open the camera for a capture; close it when that ends in a DeviceError."""
+        try:
+            self.open()
+            yield
+        except DeviceError:
+            self.close()
+            raise
+
+
+def read_description(path: Path) -> dict[str, Any] | None:
+    """Read what a camera said of itself when it was first opened; ``None`` when it never was.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
+        raise ConfigError(
+            f"{path}: cannot read what the camera said of itself: {err}",
+            hint="delete it; opening writes it anew",
+        ) from err
+
+
+def write_description(path: Path, table: Mapping[str, Any]) -> None:
+    """Keep what a camera said of itself; the same content again writes nothing.
+
+    Raises
+    ------
+    ConfigError
+        The folder cannot be written.
+    """
+    import tomli_w
+
+    text = tomli_w.dumps(table)
+    try:
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            write_text(path, text)
+    except OSError as err:
+        raise ConfigError(
+            f"{path}: cannot write what the camera said of itself: {err}",
+            hint='name a writable file: description = "..."',
+        ) from err
+
+
+def described(
+    said: Mapping[str, Any] | None, table: Mapping[str, Any], wanted: Iterable[str], where: str
+) -> dict[str, Any]:
+    """Lay the station's settings over what a camera said of itself.
+
+    Parameters
+    ----------
+    said
+        ``None`` before the camera was first opened.
+    table
+        The station's ``[tof]`` or ``[stereo]``.
+    wanted
+        Names that the description must have.
+    where
+        For messages.
+
+    Raises
+    ------
+    ConfigError
+        Something is missing.
+    """
+    merged = {**(said or {}), **{key: table[key] for key in wanted if key in table}}
+    if missing := [key for key in wanted if key not in merged]:
+        raise ConfigError(
+            f"{where}: expected {', '.join(missing)}, which the camera has not said",
+            hint="open it once, or write them into station.toml (camera: the intrinsics, a table of its own)",
+        )
+    return merged
+
+
+def tof_info(table: Mapping[str, Any], where: str, page: str) -> TofInfo:
+    """Turn a whole table into a ToF camera's description; ``page`` of the documentation is the hint.
+
+    Raises
+    ------
+    ConfigError
+        It says something impossible.
+    """
+    try:
+        info = tof_from(table, where)
+    except FormatError as err:
+        raise ConfigError(err.message, hint=f"see {page}") from err
+    if len(info.phase_rad) != len(info.modulation_hz):
+        raise ConfigError(f"{where}: expected one phase_rad for each modulation_hz")
+    return info
