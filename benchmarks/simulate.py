@@ -26,7 +26,8 @@ _VIEWS = 25  # of a scene of the dataset
 def capture(suite: str, index: int, views: int, folder: str) -> tuple[Counter[str], float]:
     """CPU seconds by stage, and wall-clock seconds, of one scene's views; the first scene of a process warms it up."""
     from tofcapture.suites.capture import Job, take_views
-    from tofcapture.suites.recipe import load_recipe, make_scene
+    from tofcapture.suites.make import make_scene
+    from tofcapture.suites.scene import load_recipe
 
     recipe = load_recipe(suite)
     scene = make_scene(recipe, index, 0)

@@ -15,8 +15,8 @@ from tofcapture.cli import main
 from tofcapture.errors import ConfigError
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.shard import ShardReader
-from tofcapture.suites import capture, make
-from tofcapture.suites.make import Wish, make_one
+from tofcapture.suites import capture
+from tofcapture.suites.make import DatasetSpec, make_one
 from tofcapture.suites.run import simulate_dataset
 
 STEREO = {"width": 160, "height": 128, "fx": 144.4, "fy": 144.4, "cx": 79.5, "cy": 63.5}
@@ -30,8 +30,8 @@ STATION = "\n".join(
 )
 
 
-def wish(suite="multipath", scenes=2, frames=2):
-    return Wish(suite, 0, scenes, views=2, frames=frames, sim=SIM)
+def spec(suite="multipath", scenes=2, frames=2):
+    return DatasetSpec(suite, 0, scenes, views=2, frames=frames, sim=SIM)
 
 
 def shards(out):
@@ -49,7 +49,7 @@ def station(tmp_path_factory):
 def whole(tmp_path_factory):
     """An uninterrupted run of two multipath scenes."""
     out = tmp_path_factory.mktemp("whole") / "data"
-    simulate_dataset(wish(), out, jobs=1)
+    simulate_dataset(spec(), out, jobs=1)
     return out
 
 
@@ -89,13 +89,13 @@ def test_shards_tell_where_they_came_from(whole):
 
 def test_scenes_take_turns_with_cameras(tmp_path):
     """Two rigs: other factory calibration and fixed pattern, scene by scene; one split for all if wanted."""
-    two = replace(wish(scenes=3), cameras=2, views=1)
+    two = replace(spec(scenes=3), cameras=2, views=1)
     simulate_dataset(two, tmp_path / "data", jobs=1, split="test")
     manifest = load_manifest(tmp_path / "data")
     assert {e.split for e in manifest.scenes.values()} == {"test"}
     serials, offsets = [], []
     for index in range(3):
-        entry = manifest.scenes[make.scene_name(two, index)]
+        entry = manifest.scenes[two.scene(index).name]
         with ShardReader(tmp_path / "data" / entry.path) as shard:
             serials.append(shard.info.serial)
             offsets.append(shard.info.range_errors[0].offset)
@@ -115,9 +115,9 @@ def test_interrupted_in_the_middle_of_a_scene(tmp_path, whole, monkeypatch):
 
     monkeypatch.setattr(capture, "write_view", stop)
     with pytest.raises(KeyboardInterrupt):
-        simulate_dataset(wish(), out, jobs=1)
+        simulate_dataset(spec(), out, jobs=1)
     monkeypatch.setattr(capture, "write_view", write)
-    result = simulate_dataset(wish(), out, jobs=1)
+    result = simulate_dataset(spec(), out, jobs=1)
     assert result.made[0].cpu["views"] == 1
     assert shards(out) == shards(whole)
 
@@ -125,44 +125,44 @@ def test_interrupted_in_the_middle_of_a_scene(tmp_path, whole, monkeypatch):
 def test_a_damaged_or_missing_shard_is_made_again(tmp_path, whole):
     """Only that scene is simulated again, with the same bytes; other options or fewer scenes are refused."""
     out = tmp_path / "data"
-    simulate_dataset(wish(), out, jobs=1)
+    simulate_dataset(spec(), out, jobs=1)
     first, second = sorted(shards(out))
     (out / "shards" / f"{first}.h5").unlink()
-    result = simulate_dataset(wish(), out, jobs=1)
+    result = simulate_dataset(spec(), out, jobs=1)
     assert [m.scene for m in result.made] == [first]
     assert [m.scene for m in result.kept] == [second]
     assert shards(out) == shards(whole)
     with pytest.raises(ConfigError, match="other options"):
-        simulate_dataset(wish(frames=3), out, jobs=1)
+        simulate_dataset(spec(frames=3), out, jobs=1)
     with pytest.raises(ConfigError, match="not wanted"):
-        simulate_dataset(wish(scenes=1), out, jobs=1)
+        simulate_dataset(spec(scenes=1), out, jobs=1)
 
 
 def test_views_of_another_wish_are_not_mixed_in(tmp_path, whole):
     """Views left by a run with other options go before the scene is taken."""
     out = tmp_path / "data"
-    other = Wish("multipath", 0, 2, views=2, frames=1, sim=SIM)
-    name = make.scene_name(other, 0)
+    other = DatasetSpec("multipath", 0, 2, views=2, frames=1, sim=SIM)
+    name = other.scene(0).name
     (out / "simulation" / f"{name}.work").mkdir(parents=True)
     (out / "simulation" / f"{name}.work" / "task").write_text(other.task(0))
     left = out / "simulation" / f"{name}.work" / "recording" / "views" / name / "view-000.h5"
     left.parent.mkdir(parents=True)
-    left.write_bytes(b"of another wish")
-    assert make_one(wish(), out, 0).sha256 == shards(whole)[name]
+    left.write_bytes(b"of another spec")
+    assert make_one(spec(), out, 0).sha256 == shards(whole)[name]
 
 
 @pytest.mark.parametrize(("change", "message"), [({"scenes": 0}, "scenes"), ({"suite": "tof1"}, "suite")])
-def test_wrong_wishes_are_refused(tmp_path, change, message):
+def test_wrong_specs_are_refused(tmp_path, change, message):
     """Nothing wanted, or a suite that does not exist."""
     with pytest.raises(ConfigError, match=message):
-        simulate_dataset(wish(**change), tmp_path / "data", jobs=1)
+        simulate_dataset(spec(**change), tmp_path / "data", jobs=1)
 
 
 def test_a_recording_is_not_overwritten(tmp_path):
     """A folder that holds a recording is not taken for a dataset."""
     (tmp_path / "views").mkdir()
     with pytest.raises(ConfigError, match="recording"):
-        simulate_dataset(wish(), tmp_path, jobs=1)
+        simulate_dataset(spec(), tmp_path, jobs=1)
 
 
 @pytest.mark.slow

@@ -10,9 +10,9 @@ from tofcapture.devices.sim.scenes import TABLE_CENTRE, generator
 from tofcapture.errors import ConfigError
 from tofcapture.files.manifest import object_of
 from tofcapture.files.view import check_scene_name
-from tofcapture.suites.make import Wish
-from tofcapture.suites.recipe import SUITES, load_recipe, make_scene
+from tofcapture.suites.make import DatasetSpec, make_scene
 from tofcapture.suites.rooms import _PROBE
+from tofcapture.suites.scene import SUITES, load_recipe
 from tofcapture.suites.tabletop import table_meshes
 
 PLY = """ply
@@ -115,11 +115,14 @@ def test_kinds_replace_the_pattern_and_every_mesh_has_its_turn(tmp_path):
     for name in ("one", "two", "three"):
         (tmp_path / f"{name}.ply").write_text(PLY.format(size=80))
     meshes = table_meshes(tmp_path, "mm", 0)
-    wish = Wish("tof100", 0, 10, meshes=meshes, kinds=("mesh", "object", "mesh", "dark", "mesh"))
-    made = [make_scene(wish.recipe(), i, 0, meshes) for i in range(10)]
-    assert [m.facts["kind"] for m in made] == list(wish.kinds) * 2
+    spec = DatasetSpec("tof100", 0, 10, meshes=meshes, kinds=("mesh", "object", "mesh", "dark", "mesh"))
+    made = [make_scene(spec.recipe(), i, 0, meshes) for i in range(10)]
+    assert [m.facts["kind"] for m in made] == list(spec.kinds) * 2
     assert len({m.name for m in made}) == 10
-    for wrong in (Wish("tof100", 0, 1, kinds=("sphere",)), Wish("indoor", 0, 1, kinds=("mesh",))):
+    for wrong in (
+        DatasetSpec("tof100", 0, 1, kinds=("sphere",)),
+        DatasetSpec("indoor", 0, 1, kinds=("mesh",)),
+    ):
         with pytest.raises(ConfigError, match="--kinds"):
             wrong.recipe()
 

@@ -137,10 +137,12 @@ def log(T: Float64) -> Float64:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), roll: float = 0.0) -> Float64:
-    """Pose a camera (x right, y down, z forward) at ``eye`` (3,) so that it looks at ``target`` (3,), metres.
+    """Pose a camera (x right, y down, z forward) so that it looks at a point.
 
     Parameters
     ----------
+    eye, target
+        Points (3,) of the world, metres.
     up
         World direction that should appear upwards; replaced by world x when the view is parallel to it.
     roll

@@ -1,10 +1,10 @@
-"""The views of one scene of a suite, as sealed view files."""
+"""Take the views of one scene of a suite, as sealed view files."""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, View
 from tofcapture.poses import invert
 from tofcapture.record.plan import object_sampling, plan_views
-from tofcapture.suites.recipe import Scene
+from tofcapture.suites.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -35,16 +35,12 @@ class Job:
 
     Attributes
     ----------
-    scene
-        What stands there.
-    seed
-        Of the dataset: one camera, one bracket, one arm for all of its scenes.
+    scene, seed
+        What stands there; the seed of its rig: one camera, one bracket, one arm.
     views, frames
         Views of the scene, ToF frames of each burst.
-    sim
-        Overrides of the simulator's constants for the whole dataset.
-    provenance
-        Stored in every view.
+    sim, provenance
+        Overrides of the simulator's constants for the whole dataset; what every view says of its origin.
     """
 
     scene: Scene
@@ -56,7 +52,7 @@ class Job:
 
 
 def layered(*tables: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables of tables, the later ones laid over the earlier ones."""
+    """Lay tables of tables over each other, the later ones over the earlier ones."""
     out: dict[str, Any] = {}
     for table in tables:
         for name, values in table.items():
@@ -64,15 +60,13 @@ def layered(*tables: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def station_sim() -> dict[str, Any]:
-    """Constants of the embedded simulated station: the lamp lights the image and little beside it."""
-    return {k: v for k, v in read_station(None)["sim"].items() if isinstance(v, Mapping)}
-
-
 def make_world(job: Job) -> SimWorld:
-    """World of a scene: devices of the dataset, constants of the scene."""
-    where = f"scene {job.scene.name}"
-    constants = read_constants(layered(station_sim(), job.sim, job.scene.sim), where)
+    """Make the world of a scene: devices of the dataset, constants of the scene.
+
+    Under both lie those of the embedded station, whose lamp lights the image and little beside it.
+    """
+    station = {k: v for k, v in read_station(None)["sim"].items() if isinstance(v, Mapping)}
+    constants = read_constants(layered(station, job.sim, job.scene.sim), f"scene {job.scene.name}")
     world = SimWorld(constants, job.seed, lambda _name, _seed: job.scene.objects)
     world.place(job.scene.name)
     return world
@@ -81,43 +75,47 @@ def make_world(job: Job) -> SimWorld:
 def take_views(job: Job, recording: Path) -> Counter[str]:
     """Take every view of a scene that is not there yet.
 
-    Parameters
-    ----------
-    job
-        What to take.
-    recording
-        Folder to write ``views/<scene>/view-007.h5`` into; whole views in it are kept.
+    They go into ``recording`` as ``views/<scene>/view-007.h5``; whole views in it are kept.
 
     Returns
     -------
     CPU seconds by stage (``scene``, ``poses``, ``light``, ``tof``, ``stereo``, ``truth``, ``write``), and ``views`` taken.
     """
     spent: Counter[str] = Counter()
-    clock = _Stopwatch(spent)
-    world = make_world(job)
+    last = time.process_time()
+
+    def lap(stage: str) -> None:
+        nonlocal last
+        now = time.process_time()
+        spent[stage] += now - last  # type: ignore[assignment]
+        last = now
+
+    world, poses = make_world(job), _by_arm if job.scene.poses is None else _free
     world.caster()
-    clock.lap("scene")
-    for index, before, now in _stations(job, world):
-        clock.lap("poses")
+    lap("scene")
+    for index, before, now in poses(job, world):
+        lap("poses")
         path = view_path(recording, job.scene.name, index)
         if path.is_file():
             sealed_digest(path)
             continue
-        write_view(path, _view(job, world, index, before, now, clock))
-        clock.lap("write")
+        write_view(path, _view(job, world, index, before, now, lap))
+        lap("write")
         spent["views"] += 1
     return spent
 
 
-def _view(job: Job, world: SimWorld, index: int, before: ArmState, now: SimClock, clock: _Stopwatch) -> View:
+def _view(
+    job: Job, world: SimWorld, index: int, before: ArmState, now: SimClock, lap: Callable[[str], None]
+) -> View:
     world.light()
-    clock.lap("light")
+    lap("light")
     tof = world.tof(job.frames, now)
-    clock.lap("tof")
+    lap("tof")
     stereo = world.stereo(now)
-    clock.lap("stereo")
+    lap("stereo")
     truth = world.truth()
-    clock.lap("truth")
+    lap("truth")
     after = ArmState(before.joints, before.T_base_flange, now())
     rig = world.nominal_rig()
     return View(job.scene.name, index, tof, stereo, before, after, rig, _provenance(job), truth)
@@ -138,13 +136,8 @@ def _provenance(job: Job) -> dict[str, Any]:
     }
 
 
-def _stations(job: Job, world: SimWorld) -> Iterator[tuple[int, ArmState, SimClock]]:
-    """Bring the rig to every view: number, arm state, clock."""
-    yield from _by_arm(job, world) if job.scene.poses is None else _free(job, world)
-
-
 def _by_arm(job: Job, world: SimWorld) -> Iterator[tuple[int, ArmState, SimClock]]:
-    """Views that the embedded station's arm reaches, planned as for a real scene."""
+    """Bring the embedded station's arm to views that are planned as for a real scene: number, arm state, clock."""
     config = read_station(None)
     model = arm_model(config["arm"]["model"])
     context = StationContext(config=config, folder=Path(), shared={"sim": world})
@@ -157,7 +150,7 @@ def _by_arm(job: Job, world: SimWorld) -> Iterator[tuple[int, ArmState, SimClock
 
 
 def _free(job: Job, world: SimWorld) -> Iterator[tuple[int, ArmState, SimClock]]:
-    """Views from anywhere: the "flange" stands where the ToF camera needs it, joints are not known."""
+    """Take views from anywhere: the "flange" stands where the ToF camera needs it, joints are not known."""
     assert job.scene.poses is not None
     rng = generator(job.scene.plan_name, job.seed, "suite poses")
     from_tof = invert(world.true_rig.T_flange_tof)
@@ -166,16 +159,3 @@ def _free(job: Job, world: SimWorld) -> Iterator[tuple[int, ArmState, SimClock]]
         world.set_pose(T, f"{index}".encode() + np.round(T, 9).tobytes())
         clock = SimClock()
         yield index, ArmState(np.full(6, np.nan), T, clock()), clock
-
-
-class _Stopwatch:
-    """Counts CPU seconds of this process by stage."""
-
-    def __init__(self, spent: Counter[str]) -> None:
-        self._spent, self._last = spent, time.process_time()
-
-    def lap(self, stage: str) -> None:
-        """Book what passed since the last lap."""
-        now = time.process_time()
-        self._spent[stage] += now - self._last  # type: ignore[assignment]
-        self._last = now

@@ -9,10 +9,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,15 +22,39 @@ from tofcapture import __version__
 from tofcapture.devices.sim import VERSION
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.seal import digest_path, sealed_digest, write_text
+from tofcapture.suites import corners, rooms, tabletop
 from tofcapture.suites.capture import Job, layered, take_views
-from tofcapture.suites.recipe import Recipe, digest, load_recipe, make_scene
+from tofcapture.suites.scene import Recipe, Scene, load_recipe
 
 _RIGS_APART = 1_000_003
 
 
+def make_scene(
+    recipe: Recipe, index: int, seed: int, meshes: Sequence[Path] = (), mesh_unit: str = "mm"
+) -> Scene:
+    """Make scene ``index`` of a suite: a function of recipe, seed, index and meshes alone.
+
+    Parameters
+    ----------
+    recipe, seed
+        The suite; the seed of the whole dataset.
+    index
+        From 0; more scenes never change the ones before.
+    meshes, mesh_unit
+        Files for the scenes of kind ``mesh`` (tof100), and their unit.
+    """
+    if recipe.name == "indoor":
+        return rooms.make(recipe, index, seed)
+    if recipe.name == "multipath":
+        return corners.make(recipe, index, seed)
+    if recipe.name == "noise":
+        return tabletop.make_level(recipe, index, seed)
+    return tabletop.make(recipe, index, seed, meshes, mesh_unit)
+
+
 @dataclass(frozen=True)
-class Wish:
-    """What dataset is wanted: everything that its bytes depend on, but for versions.
+class DatasetSpec:
+    """A dataset to simulate: everything that its bytes depend on, but for versions.
 
     Attributes
     ----------
@@ -60,13 +85,7 @@ class Wish:
     kinds: tuple[str, ...] = ()
 
     def recipe(self) -> Recipe:
-        """Load the suite's recipe, with the kinds that are wanted.
-
-        Raises
-        ------
-        ConfigError
-            No such suite, or no such kind in it.
-        """
+        """Load the suite's recipe with the kinds that are wanted; :class:`ConfigError` when it has no such kind."""
         recipe = load_recipe(self.suite)
         if not self.kinds:
             return recipe
@@ -77,15 +96,19 @@ class Wish:
             )
         return replace(recipe, table={**recipe.table, "pattern": list(self.kinds)})
 
+    def scene(self, index: int) -> Scene:
+        """Make scene ``index``."""
+        return make_scene(self.recipe(), index, self.seed, self.meshes, self.mesh_unit)
+
     def rig_seed(self, index: int) -> int:
-        """Seed of the rig that takes scene ``index``; a rig's seed is the dataset's and a multiple of a large prime."""
+        """Choose the seed of the rig that takes scene ``index``: the dataset's and a multiple of a large prime."""
         return self.seed + _RIGS_APART * (index % self.cameras)
 
     def task(self, index: int) -> str:
-        """Digest of everything that scene ``index`` depends on."""
-        recipe = self.recipe()
+        """Digest everything that scene ``index`` depends on."""
         table = {**asdict(self), "scenes": index, "meshes": [p.name for p in self.meshes]}
-        return digest(table, recipe.table, __version__, VERSION)
+        parts = (table, self.recipe().table, __version__, VERSION)
+        return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -97,15 +120,11 @@ class Made:
     scene, sha256, views
         Name, digest of the shard, views in it.
     task
-        :meth:`Wish.task` that it came from.
-    objects
-        Identities of its objects.
-    facts
-        What the recipe says of it.
-    cpu
-        CPU seconds by stage, of the process that made it; ``build`` is the shard's.
-    seconds
-        Wall clock.
+        :meth:`DatasetSpec.task` that it came from.
+    objects, facts
+        Identities of its objects, and what the recipe says of it.
+    cpu, seconds
+        CPU seconds by stage of the process that made it (``build`` is the shard's), and wall clock.
     bytes
         Of the shard.
     config, versions
@@ -126,61 +145,47 @@ class Made:
 
 
 def paths(out: Path, scene: str) -> tuple[Path, Path, Path]:
-    """Work folder, note and shard of a scene."""
-    return (
-        out / "simulation" / f"{scene}.work",
-        out / "simulation" / f"{scene}.json",
-        out / "shards" / f"{scene}.h5",
-    )
+    """Name work folder, note and shard of a scene."""
+    folder = out / "simulation"
+    return folder / f"{scene}.work", folder / f"{scene}.json", out / "shards" / f"{scene}.h5"
 
 
-def scene_name(wish: Wish, index: int) -> str:
-    """Name of a scene of a dataset."""
-    return make_scene(wish.recipe(), index, wish.seed, wish.meshes, wish.mesh_unit).name
-
-
-def read_note(out: Path, scene: str) -> Made | None:
-    """The note of a scene; ``None`` when there is none that can be read."""
-    try:
-        return Made(**json.loads(paths(out, scene)[1].read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        return None
-
-
-def finished(wish: Wish, out: Path, index: int, scene: str) -> Made | None:
-    """The note of a scene whose shard is in place, and whole.
+def finished(spec: DatasetSpec, out: Path, index: int, scene: str) -> Made | None:
+    """Read the note of a scene whose shard is in place, and whole; ``None`` when there is none.
 
     Raises
     ------
     ConfigError
-        The scene is there, but of another wish.
+        The scene is there, but of another spec.
     """
-    made = read_note(out, scene)
-    if made is None:
+    _, note, shard = paths(out, scene)
+    try:
+        made = Made(**json.loads(note.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
         return None
-    if made.task != wish.task(index):
+    if made.task != spec.task(index):
         raise ConfigError(
             f"{out}: {scene} was made with other options, or by another version",
             hint="name another folder, or remove this one",
         )
     try:
-        return made if sealed_digest(paths(out, scene)[2]) == made.sha256 else None
+        return made if sealed_digest(shard) == made.sha256 else None
     except DataError:
         return None
 
 
-def make_one(wish: Wish, out: Path, index: int) -> Made:
+def make_one(spec: DatasetSpec, out: Path, index: int) -> Made:
     """Simulate one scene, build its shard, put it in place, note it, and remove the views."""
     from tofcapture.dataset.build import build_dataset
     from tofcapture.dataset.sample import SampleConfig
     from tofcapture.files.manifest import load_manifest
 
-    start, recipe, task = time.monotonic(), wish.recipe(), wish.task(index)
-    scene = make_scene(recipe, index, wish.seed, wish.meshes, wish.mesh_unit)
+    start, recipe, task = time.monotonic(), spec.recipe(), spec.task(index)
+    scene = spec.scene(index)
     work, note, shard = paths(out, scene.name)
     _make_room(work, task)
-    provenance = {"suite": wish.suite, "recipe": recipe.version, "index": index, "task": task}
-    job = Job(scene, wish.rig_seed(index), wish.views, wish.frames, layered(recipe.sim, wish.sim), provenance)
+    provenance = {"suite": spec.suite, "recipe": recipe.version, "index": index, "task": task}
+    job = Job(scene, spec.rig_seed(index), spec.views, spec.frames, layered(recipe.sim, spec.sim), provenance)
     cpu = take_views(job, work / "recording")
     begun = time.process_time()
     config = SampleConfig(**recipe.build)

@@ -9,23 +9,18 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from tofcapture.errors import ConfigError, TofError
-from tofcapture.suites.make import Made, Wish, finished, make_one, scene_name
+from tofcapture.pool import Pool
+from tofcapture.suites.make import DatasetSpec, Made, finished, make_one
 
 Progress = Callable[[int, int], None]
 """Called with views finished and views in all, about once a second."""
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _VIEW_BYTES, _SHARD_BYTES, _RESERVE_BYTES = 14e6, 8e6, 0.5e9  # of one full-size view
-_POLL = 1.0  # s
 _CAPTURE = 0.7  # share of a view's work that is done when it is captured; the rest is its ground truth
 
 
@@ -56,16 +51,18 @@ class Simulated:
 
 
 def simulate_dataset(
-    wish: Wish, out: Path, jobs: int | None = None, progress: Progress | None = None, split: str | None = None
+    spec: DatasetSpec,
+    out: Path,
+    jobs: int | None = None,
+    progress: Progress | None = None,
+    split: str | None = None,
 ) -> Simulated:
     """Simulate and build a dataset, or complete one.
 
     Parameters
     ----------
-    wish
-        What is wanted.
-    out
-        The dataset's folder.
+    spec, out
+        What is wanted, and the dataset's folder.
     jobs
         Processes; by default one per core. ``1`` works in this process.
     progress
@@ -78,56 +75,56 @@ def simulate_dataset(
     ConfigError
         Nothing is wanted, the folder holds something else, or the disk is too small.
     TofError
-        A worker process died.
+        A worker process died too often.
     """
     start = time.monotonic()
-    _check(wish, out)
+    _check(spec, out)
     jobs = jobs if jobs is not None else os.cpu_count() or 1
-    done = _there(wish, out)
-    todo = [i for i in range(wish.scenes) if i not in done]
-    _check_space(wish, out, len(todo), min(jobs, len(todo)))
-    made = dict(_run(wish, out, todo, jobs, lambda views: _tell(progress, wish, len(done), views)))
+    done = _there(spec, out)
+    todo = [i for i in range(spec.scenes) if i not in done]
+    _check_space(spec, out, len(todo), min(jobs, len(todo)))
+
+    def tell(views: int) -> None:
+        if progress is not None:
+            progress(len(done) * spec.views + views, spec.scenes * spec.views)
+
+    made = dict(_run(spec, out, todo, jobs, tell))
     splits, gt = _finish(out, [*done.values(), *made.values()], split)
     return Simulated(out, tuple(made.values()), tuple(done.values()), splits, gt, time.monotonic() - start)
 
 
-def _there(wish: Wish, out: Path) -> dict[int, Made]:
-    """Scenes that need not be made again; a folder with scenes of another wish is refused."""
-    names = [scene_name(wish, i) for i in range(wish.scenes)]
+def _there(spec: DatasetSpec, out: Path) -> dict[int, Made]:
+    """Scenes that need not be made again; a folder with scenes of another spec is refused."""
+    names = [spec.scene(i).name for i in range(spec.scenes)]
     others = {p.stem for p in (out / "simulation").glob("*.json")} - set(names)
     if others:
         raise ConfigError(
             f"{out}: holds {len(others)} scenes that are not wanted: {', '.join(sorted(others)[:3])} ...",
             hint="the same --suite and --seed with at least as many --scenes as before, or another --out",
         )
-    found = {i: finished(wish, out, i, name) for i, name in enumerate(names)}
+    found = {i: finished(spec, out, i, name) for i, name in enumerate(names)}
     return {i: made for i, made in found.items() if made is not None}
 
 
-def _tell(progress: Progress | None, wish: Wish, kept: int, views: int) -> None:
-    if progress is not None:
-        progress(kept * wish.views + views, wish.scenes * wish.views)
-
-
-def _check(wish: Wish, out: Path) -> None:
-    wish.recipe()
-    if wish.suite == "noise" and wish.cameras > 1:
+def _check(spec: DatasetSpec, out: Path) -> None:
+    spec.recipe()
+    if spec.suite == "noise" and spec.cameras > 1:
         raise ConfigError(
             "--cameras: the suite noise holds levels of one scene against each other, by one camera"
         )
     for name in ("scenes", "views", "frames", "cameras"):
-        if getattr(wish, name) < 1:
-            raise ConfigError(f"--{name}: expected at least 1, got {getattr(wish, name)}")
+        if getattr(spec, name) < 1:
+            raise ConfigError(f"--{name}: expected at least 1, got {getattr(spec, name)}")
     if (out / "views").exists():
         raise ConfigError(f"{out}: this is a recording", hint="name another folder for the dataset")
 
 
-def _check_space(wish: Wish, out: Path, scenes: int, jobs: int) -> None:
+def _check_space(spec: DatasetSpec, out: Path, scenes: int, jobs: int) -> None:
     """Refuse to begin what the disk cannot hold: all shards, and the views of the scenes at work."""
     out.mkdir(parents=True, exist_ok=True)
-    if wish.sim or not scenes:
+    if spec.sim or not scenes:
         return
-    need = wish.views * (scenes * _SHARD_BYTES + jobs * (_VIEW_BYTES + _SHARD_BYTES)) + _RESERVE_BYTES
+    need = spec.views * (scenes * _SHARD_BYTES + jobs * (_VIEW_BYTES + _SHARD_BYTES)) + _RESERVE_BYTES
     free = shutil.disk_usage(out).free
     if free < need:
         raise ConfigError(
@@ -137,56 +134,28 @@ def _check_space(wish: Wish, out: Path, scenes: int, jobs: int) -> None:
 
 
 def _run(
-    wish: Wish, out: Path, todo: Sequence[int], jobs: int, tell: Callable[[int], None]
+    spec: DatasetSpec, out: Path, todo: Sequence[int], jobs: int, tell: Callable[[int], None]
 ) -> Iterator[tuple[int, Made]]:
     """Make scenes, here or in processes of one thread each."""
     if jobs <= 1 or len(todo) <= 1:
         for turn, index in enumerate(todo):
-            tell(turn * wish.views)
-            yield index, make_one(wish, out, index)
-        tell(len(todo) * wish.views)
+            tell(turn * spec.views)
+            yield index, make_one(spec, out, index)
+        tell(len(todo) * spec.views)
         return
-    with _one_thread(), ProcessPoolExecutor(min(jobs, len(todo)), mp_context=get_context("spawn")) as pool:
-        left = {pool.submit(make_one, wish, out, index): index for index in todo}
-        try:
-            yield from _collect(left, wish, out, tell)
-        except BrokenProcessPool as err:
-            raise TofError(
-                "a worker process died",
-                hint="run the same command again: it goes on; out of memory: --jobs 1",
-            ) from err
-        finally:
-            for future in left:
-                future.cancel()
-
-
-def _collect(
-    left: dict[Future[Made], int], wish: Wish, out: Path, tell: Callable[[int], None]
-) -> Iterator[tuple[int, Made]]:
     done = 0
-    while left:
-        ready, _ = wait(left, timeout=_POLL, return_when=FIRST_COMPLETED)
-        for future in ready:
-            index = left.pop(future)
-            yield index, future.result()
-            done += wish.views
+
+    def tick() -> None:
         taken = len(list((out / "simulation").glob("*.work/recording/views/*/view-*.h5")))
         tell(done + int(_CAPTURE * taken))
 
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Processes that start now use one thread each; this one keeps its own."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+    with Pool(min(jobs, len(todo))) as pool:
+        for turn, made in pool.run(make_one, [(spec, out, index) for index in todo], tick):
+            if isinstance(made, TofError):
+                raise made
+            done += spec.views
+            tick()
+            yield todo[turn], made
 
 
 def _finish(

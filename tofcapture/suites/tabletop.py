@@ -1,4 +1,4 @@
-"""Scenes on the arm's table: the simulated ToF-100 and the noise suite."""
+"""Make scenes on the arm's table: the simulated ToF-100 and the noise suite."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from tofcapture.devices.sim.scenes import (
     TABLE_CENTRE,
     arranged,
     generator,
+    mesh_files,
     read_table_mesh,
     solid,
     surroundings,
@@ -22,14 +23,14 @@ from tofcapture.devices.sim.scenes import (
 from tofcapture.devices.sim.shapes import FAMILIES
 from tofcapture.errors import ConfigError
 from tofcapture.meshes import Mesh, cuboid
-from tofcapture.suites.recipe import Recipe, Scene
+from tofcapture.suites.scene import Recipe, Scene
 
 _PANEL = (0.26, 0.008, 0.22)  # m; length, thickness, height: within the cylinder that the arm keeps out of
 _SHEET = 0.001  # m
 
 
 def make(recipe: Recipe, index: int, seed: int, meshes: Sequence[Path], mesh_unit: str) -> Scene:
-    """Scene of the simulated ToF-100; see ``recipes/tof100.toml``."""
+    """Make a scene of the simulated ToF-100; see ``recipes/tof100.toml``."""
     pattern: list[str] = recipe.table["pattern"]
     kind = pattern[index % len(pattern)]
     if kind == "mesh" and meshes:
@@ -42,7 +43,7 @@ def make(recipe: Recipe, index: int, seed: int, meshes: Sequence[Path], mesh_uni
 
 
 def make_level(recipe: Recipe, index: int, seed: int) -> Scene:
-    """Scene of the noise suite: a base scene at one level of exposure and ambient light."""
+    """Make a scene of the noise suite: a base scene at one level of exposure and ambient light."""
     levels: list[dict[str, float]] = recipe.table["level"]
     base, level = divmod(index, len(levels))
     kind = recipe.table["pattern"][base % len(recipe.table["pattern"])]
@@ -57,7 +58,7 @@ def make_level(recipe: Recipe, index: int, seed: int) -> Scene:
 
 
 def _procedural(recipe: Recipe, stem: str, kind: str, seed: int) -> Scene:
-    """Objects of seeded families; every scene has instances of its own."""
+    """Put objects of seeded families up; every scene has instances of its own."""
     table = recipe.table["kind"][kind]
     rng = generator(stem, seed, "suite objects")
     choice = table.get("families") or [f for f in FAMILIES if f != "board"]
@@ -98,7 +99,7 @@ def _scene(
 def _material(
     materials: Mapping[str, Sequence[float]], chosen: list[str]
 ) -> Callable[[np.random.Generator], float]:
-    """Draw a material and an albedo of it; notes the material's name."""
+    """Return what draws a material and an albedo of it, and notes the material's name."""
     names = list(materials)
 
     def draw(rng: np.random.Generator) -> float:
@@ -112,7 +113,7 @@ def _material(
 def _panels(
     count: int, rng: np.random.Generator, albedo: Callable[[np.random.Generator], float]
 ) -> list[SceneObject]:
-    """Upright panels behind the object that meet in a corner; part of the target."""
+    """Stand panels behind the object that meet in a corner; part of the target."""
     if not count:
         return []
     facing, opening = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(80, 110))
@@ -122,21 +123,13 @@ def _panels(
     for side in range(count):
         turn = facing + (opening / 2 if side else -opening / 2)
         along = np.array([np.cos(turn), np.sin(turn), 0.0])
-        out.append(
-            solid(
-                "panel",
-                cuboid(*_PANEL),
-                albedo(rng),
-                apex + (length / 2 + thickness) * along,
-                (0, 0, turn),
-                target=True,
-            )
-        )
+        at = apex + (length / 2 + thickness) * along
+        out.append(solid("panel", cuboid(*_PANEL), albedo(rng), at, (0, 0, turn), target=True))
     return out
 
 
 def _sheets(most: int, materials: Mapping[str, Any], rng: np.random.Generator) -> list[SceneObject]:
-    """Thin cloths or papers on the table: albedo changes where depth does not."""
+    """Lay thin cloths or papers on the table: albedo changes where depth does not."""
     albedo = _material(materials, [])
     out = []
     for k in range(int(rng.integers(0, most + 1))):
@@ -148,7 +141,7 @@ def _sheets(most: int, materials: Mapping[str, Any], rng: np.random.Generator) -
 
 
 def table_meshes(folder: Path, mesh_unit: str, seed: int) -> tuple[Path, ...]:
-    """Meshes of a folder that fit on the table and under the arm, in a seeded order.
+    """List the meshes of a folder that fit on the table and under the arm, in a seeded order.
 
     Raises
     ------
@@ -157,7 +150,7 @@ def table_meshes(folder: Path, mesh_unit: str, seed: int) -> tuple[Path, ...]:
     """
     if not folder.is_dir():
         raise ConfigError(f"--meshes {folder}: expected a folder of PLY, OBJ or STL files")
-    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in {".ply", ".obj", ".stl"})
+    paths = mesh_files(folder)
     sizes: dict[Path, Any] = {}
     for path in paths:
         try:

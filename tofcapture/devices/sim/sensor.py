@@ -152,14 +152,14 @@ def scatter(image: NDArray[Any], share: float, radius: float) -> NDArray[Any]:
 def expose(
     light: Light, sensor: Sensor, info: TofInfo, frames: int, rng: np.random.Generator, serial: int
 ) -> tuple[NDArray[Any], Float64]:
-    """Take a static burst of ``frames`` frames.
+    """Take a static burst.
 
     Parameters
     ----------
     light, sensor, info
         What reaches the pixels, the electronics, channels and intrinsics.
-    rng
-        Noise of this burst.
+    frames, rng
+        Frames of this burst, and its noise.
     serial
         Seeds what is fixed in this one camera: the offset of each pixel.
 

@@ -1,9 +1,7 @@
-"""Recipes: a suite's file, and the scenes that come of it."""
+"""What a suite is: its recipe, and the scenes that come of it."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,22 +22,14 @@ Poses = Callable[[Caster, np.random.Generator, int], Sequence[Float64]]
 
 @dataclass(frozen=True)
 class Recipe:
-    """A suite.
-
-    Attributes
-    ----------
-    name
-        One of :data:`SUITES`.
-    table
-        What its TOML file says.
-    """
+    """A suite: one of :data:`SUITES`, and what its TOML file says."""
 
     name: str
     table: Mapping[str, Any]
 
     @property
     def version(self) -> int:
-        """Raised with every change that changes scenes."""
+        """Number that is raised with every change that changes scenes."""
         return int(self.table["version"])
 
     @property
@@ -85,46 +75,8 @@ class Scene:
 
 
 def load_recipe(name: str) -> Recipe:
-    """Read one of the packaged recipes.
-
-    Raises
-    ------
-    ConfigError
-        No such suite.
-    """
+    """Read one of the packaged recipes; :class:`ConfigError` when there is no such suite."""
     if name not in SUITES:
         raise ConfigError(f"suite: expected one of {', '.join(SUITES)}, got {name!r}")
     path = Path(__file__).with_name("recipes") / f"{name}.toml"
     return Recipe(name, tomllib.loads(path.read_text(encoding="utf-8")))
-
-
-def make_scene(
-    recipe: Recipe, index: int, seed: int, meshes: Sequence[Path] = (), mesh_unit: str = "mm"
-) -> Scene:
-    """Scene number ``index`` of a suite: a function of recipe, seed, index and meshes alone.
-
-    Parameters
-    ----------
-    recipe
-        The suite.
-    index
-        From 0; more scenes never change the ones before.
-    seed
-        Of the whole dataset.
-    meshes, mesh_unit
-        Files for the scenes of kind ``mesh`` (tof100), and their unit.
-    """
-    from tofcapture.suites import corners, rooms, tabletop
-
-    if recipe.name == "indoor":
-        return rooms.make(recipe, index, seed)
-    if recipe.name == "multipath":
-        return corners.make(recipe, index, seed)
-    if recipe.name == "noise":
-        return tabletop.make_level(recipe, index, seed)
-    return tabletop.make(recipe, index, seed, meshes, mesh_unit)
-
-
-def digest(*parts: object) -> str:
-    """Short digest of JSON types."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:16]
