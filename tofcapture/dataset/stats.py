@@ -170,7 +170,9 @@ class DatasetStats:
         }
 
 
-def dataset_stats(dataset: Path, progress: Callable[[int, int], None] = lambda _done, _total: None) -> DatasetStats:
+def dataset_stats(
+    dataset: Path, progress: Callable[[int, int], None] = lambda _done, _total: None
+) -> DatasetStats:
     """Count a dataset in one pass over its shards.
 
     Parameters
@@ -197,7 +199,10 @@ def dataset_stats(dataset: Path, progress: Callable[[int, int], None] = lambda _
                 arrays, mask, flags = _view(shard, view)
                 split.add(arrays, mask, flags)
                 numbers = {key: _median(values) for key, values in arrays.items()}
-                numbers |= {"good_share": float((mask == 0).mean()), "flagged_share": float((flags != 0).mean())}
+                numbers |= {
+                    "good_share": float((mask == 0).mean()),
+                    "flagged_share": float((flags != 0).mean()),
+                }
                 rows.append({"scene": name, "split": entry.split, "view": view, **numbers})
         progress(len(rows), total)
     return DatasetStats(Path(dataset), sha256_of(manifest_path(dataset)), splits, rows, outliers(rows))
