@@ -22,8 +22,7 @@ from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
 from tofcapture.files.seal import sha256_of
-from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, TofMaps
-from tofcapture.files.shard_writer import ShardWriter
+from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardWriter, TofMaps
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.ops.phase import taps
 from tofcapture.poses import look_at
