@@ -34,8 +34,8 @@ lint: $(STAMP)
 	$(VENV)/bin/lint-imports
 
 docs: $(STAMP)
-	$(VENV)/bin/python -m tofcapture.files.layout > docs/formats.md
-	$(VENV)/bin/python -m tofcapture.record.daemon.schema > docs/openapi.json
+	$(VENV)/bin/python -m tofcapture.files.page > docs/formats.md
+	$(VENV)/bin/python -m tofcapture.record.daemon.app > docs/openapi.json
 	$(VENV)/bin/python -m sphinx -q -W --keep-going -b html docs build/docs
 
 # What needs an NVIDIA GPU: its tests, and the times that no other machine can tell.

@@ -5,7 +5,8 @@
 The worker's environment: ``BENCH_DELAY`` seconds per device step, ``BENCH_LOG`` a file that gets a line per move and stop of the arm,
 ``BENCH_FULL`` a file: while it exists, the disk is full from the write on whose number stands in it;
 ``BENCH_ASKS`` set: a person must confirm the scene; ``BENCH_HOST`` set: the arm has a driver host; ``BENCH_LARGE`` set: images of full size;
-``BENCH_REAL`` set: the arm is a real one. The daemon's: ``BENCH_LOST`` seconds of silence after which a recorder is killed.
+``BENCH_REAL`` set: the arm is a real one. The daemon's: ``BENCH_LOST`` seconds of silence after which a recorder is killed,
+``BENCH_IDLE`` seconds that a connection may take.
 """
 
 from __future__ import annotations
@@ -261,12 +262,12 @@ def _fill_disk(flag: Path) -> None:
 
 
 def _few_candidates() -> None:
-    from tofcapture.record import scene_plan
+    from tofcapture.record import plan
     from tofcapture.record.plan import object_sampling
 
     sampling = object_sampling()
     few = type(sampling)(sampling.axis, directions=60, distances=(0.5, 0.8))
-    scene_plan.object_sampling = lambda: few
+    plan.object_sampling = lambda: few
 
 
 def worker(station: str) -> None:
@@ -288,17 +289,18 @@ def worker(station: str) -> None:
 
 def daemon(args: argparse.Namespace) -> None:
     """Run a daemon whose recorder is :func:`worker`."""
-    from tofcapture.record.daemon import supervisor
+    from tofcapture.record.daemon import guard
     from tofcapture.record.daemon.server import serve, tcp_address
-    from tofcapture.record.daemon.settings import Settings
-    from tofcapture.record.daemon.state import open_folder
+    from tofcapture.record.daemon.settings import Settings, open_folder
 
-    if lost := os.environ.get("BENCH_LOST"):
-        supervisor._LOST = float(lost)  # noqa: SLF001
+    guard.IDLE = float(os.environ.get("BENCH_IDLE", guard.IDLE))
     args.root.mkdir(parents=True, exist_ok=True)
     toml = None if args.station == "arrays" else Path(args.station)
+    lost = float(os.environ.get("BENCH_LOST", "20"))
     command = (sys.executable, __file__, "worker", "--station", args.station)
-    settings = Settings(args.root.resolve(), open_folder(args.state), toml, worker=command)
+    settings = Settings(
+        args.root.resolve(), open_folder(args.state), toml, worker=command, silence_limit=lost
+    )
     serve(settings, tcp_address(args.http) if args.http else None, lambda url: print(url, flush=True))
 
 

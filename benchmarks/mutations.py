@@ -31,10 +31,12 @@ from tofcapture.dataset.card import write_card
 from tofcapture.errors import TofError
 from tofcapture.files.check import check
 from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
-from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardReader, ShardWriter, TofMaps
+from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardReader, TofMaps
+from tofcapture.files.shard_writer import ShardWriter
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.poses import exp
 from tofcapture.rig import Rig
+from tofcapture_model.data.shards import ShardDataset
 
 TOF, STEREO = Camera(16, 12, 12.7, 13.4, 7.8, 6.8), Camera(32, 24, 30.0, 30.0, 15.5, 11.5)
 RIG = Rig(TOF, STEREO, exp([-0.05, 0.07, 0, 0, 0.01, 0]), np.eye(4))
@@ -182,9 +184,12 @@ def read_shard(path: Path, sha256: str | None = None) -> tuple[str, str]:
 
 
 def read_dataset(folder: Path) -> str:
-    """Digest of all that readers give of the training split, each shard as the manifest promises it."""
-    scenes = load_manifest(folder).split("train")
-    return _digest(*(read_shard(folder / e.path, e.sha256)[1].encode() for e in scenes.values()))
+    """Digest of all samples of the training split."""
+    data = ShardDataset(folder, "train")
+    try:
+        return _digest(*(t.numpy() for i in range(len(data)) for t in data[i]))
+    finally:
+        data.close()
 
 
 def read_plain(path: Path) -> str:
@@ -269,7 +274,7 @@ def run(count: int, seed: int) -> list[tuple[str, str, dict[str, list[str]]]]:
 
 def _table(rows: list[tuple[str, str, dict[str, list[str]]]]) -> str:
     lines = [
-        "| corruption | of | n | check reports | readers by the manifest: error / right / wrong | ShardReader wrong | plain h5py wrong |",
+        "| corruption | of | n | check reports | ShardDataset error / right / wrong | ShardReader wrong | plain h5py wrong |",
         "|---|---|---|---|---|---|---|",
     ]
     for kind, target in sorted({(k, t) for k, t, _ in rows}):

@@ -1,4 +1,4 @@
-"""Packed splits: the same arrays as the shards, resumed, refused when stale, read by spawned workers."""
+"""Packed splits: the same arrays as the shards, resumed, refused when stale; and the dataset that reads either."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from torch.utils.data import BatchSampler, DataLoader, RandomSampler, SequentialSampler
 
 from tests.test_files_shard import write
 from tofcapture.cli import main
 from tofcapture.errors import DataError, FormatError
+from tofcapture.files import cache as packing
 from tofcapture.files.cache import open_cache, pack, verify_cache
 from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
 from tofcapture.files.shard import ShardReader
+from tofcapture_model.data.shards import ShardDataset
 
 
 def make(folder, scenes=("box", "mug"), split="train"):
@@ -45,40 +49,43 @@ def test_a_cache_holds_what_the_shards_hold(dataset, tmp_path):
                 for frame in range(shard.frames):
                     np.testing.assert_array_equal(scene.raw(view, frame), shard.raw(view, frame))
                     assert scene.celsius(view, frame) == shard.celsius(view, frame)
-                pairs = zip(
+                for a, b in zip(
                     vars(scene.ground_truth(view)).values(),
                     vars(shard.ground_truth(view, 2)).values(),
                     strict=True,
-                )
-                for a, b in pairs:
+                ):
                     np.testing.assert_array_equal(a, b)
-    fields = json.loads((tmp_path / "cache/index.json").read_text())["scenes"]["mug"]["fields"]
-    dtype = np.dtype([(n, f, tuple(s)) for n, f, s in fields], align=True)
+    table = json.loads((tmp_path / "cache/index.json").read_text())["scenes"]["mug"]["dtype"]
+    dtype = np.dtype({**table, "formats": [(f, tuple(s)) for f, s in table["formats"]]})
     plain = np.memmap(tmp_path / "cache/mug.bin", dtype, mode="r")
     np.testing.assert_array_equal(plain["raw"][1, 2], scenes["mug"].raw(1, 2))
     with pytest.raises(ValueError, match="read-only"):
         scenes["mug"].raw(0, 0)[:] = 0
 
 
-def test_packing_goes_on_where_it_was_killed(dataset, tmp_path):
+def test_packing_goes_on_where_it_was_killed(dataset, tmp_path, monkeypatch):
     """After a kill the finished scene is kept, to the file, and the result is that of an unbroken run."""
-    cache = tmp_path / "cache"
     pack(dataset, "train", tmp_path / "whole")
+    real, packed = packing._pack_scene, []
 
-    def dies_at_mug(scene, _view, _views):
-        if scene == "mug":
+    def dies_at_mug(path, *args):
+        packed.append(path.stem)
+        if path.stem == "mug":
             raise KeyboardInterrupt
+        return real(path, *args)
 
+    monkeypatch.setattr(packing, "_pack_scene", dies_at_mug)
     with pytest.raises(KeyboardInterrupt):
-        pack(dataset, "train", cache, dies_at_mug)
-    assert sorted(p.name for p in cache.iterdir()) == ["box.bin", "index.json"]
+        pack(dataset, "train", tmp_path / "cache")
     with pytest.raises(DataError, match="stale: mug"):
-        open_cache(cache, dataset)
-    packed = set()
-    pack(dataset, "train", cache, lambda scene, _view, _views: packed.add(scene))
-    assert packed == {"mug"}
+        open_cache(tmp_path / "cache", dataset)
+    monkeypatch.setattr(
+        packing, "_pack_scene", lambda path, *args: packed.append(path.stem) or real(path, *args)
+    )
+    pack(dataset, "train", tmp_path / "cache")
+    assert packed == ["box", "mug", "mug"]
     for name in ("box.bin", "mug.bin", "index.json"):
-        assert (cache / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+        assert (tmp_path / "cache" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
 def test_a_stale_cache_is_refused_and_brought_up_to_date(dataset, tmp_path):
@@ -87,11 +94,11 @@ def test_a_stale_cache_is_refused_and_brought_up_to_date(dataset, tmp_path):
     pack(dataset, "train", cache)
     make(dataset, ("mug", "gear"))
     with pytest.raises(DataError, match=r"stale: box, gear, mug changed") as info:
-        open_cache(cache, dataset)
+        ShardDataset(dataset, "train", cache)
     assert "tofcapture pack" in info.value.hint
     assert list(pack(dataset, "train", cache)) == ["gear", "mug"]
     assert sorted(p.name for p in cache.iterdir()) == ["gear.bin", "index.json", "mug.bin"]
-    assert list(open_cache(cache, dataset)) == ["gear", "mug"]
+    assert len(ShardDataset(dataset, "train", cache)) == 12
 
 
 def test_damage_is_named(dataset, tmp_path):
@@ -103,8 +110,6 @@ def test_damage_is_named(dataset, tmp_path):
     data[100] ^= 1
     scenes["mug"].path.write_bytes(data)
     assert verify_cache(cache) == ["mug"]
-    with pytest.raises(DataError, match="changed after it was sealed"):
-        open_cache(cache, dataset)["mug"].raw(0, 0)
     scenes["mug"].path.write_bytes(data[:-1])
     with pytest.raises(DataError, match=r"expected \d+ bytes"):
         open_cache(cache, dataset)["mug"].raw(0, 0)
@@ -117,10 +122,12 @@ def test_damage_is_named(dataset, tmp_path):
     with pytest.raises(DataError, match="'val' is empty"):
         pack(dataset, "val", cache)
     manifest = load_manifest(dataset)
-    write_manifest(dataset, Manifest({k: replace(e, split="val") for k, e in manifest.scenes.items()}))
+    moved = {k: replace(e, split="val") for k, e in manifest.scenes.items()}
+    write_manifest(dataset, Manifest(moved))
     with pytest.raises(FormatError, match="of the split 'val'"):
         pack(dataset, "val", cache)
-    write_manifest(dataset, Manifest({"mug": replace(manifest.scenes["mug"], sha256="0" * 64)}))
+    wrong = replace(manifest.scenes["mug"], sha256="0" * 64)
+    write_manifest(dataset, Manifest({"mug": wrong}))
     with pytest.raises(DataError, match="not the shard of the manifest"):
         pack(dataset, "train", tmp_path / "other")
     for text in ("{", "[]", '{"format": "tofcapture-cache", "version": 1}'):
@@ -137,20 +144,57 @@ def test_the_command_packs(dataset, tmp_path, capsys):
         assert json.loads(capsys.readouterr().out)["packed"] == packed
 
 
-def read_all(reader):
-    """Every frame of a reader; runs in a spawned process."""
-    return np.stack([reader.raw(v, f) for v in range(reader.views) for f in range(reader.frames)])
+@pytest.mark.parametrize("packed", [False, True])
+def test_items_are_frames_with_their_truth(dataset, tmp_path, packed):
+    """Shards and cache give the same items; an item is nobody else's memory; a list of indices is a batch of them."""
+    cache = tmp_path / "cache"
+    if packed:
+        pack(dataset, "train", cache)
+    data = ShardDataset(dataset, "train", cache if packed else None)
+    assert len(data) == 12
+    item = data[10]
+    with ShardReader(dataset / "shards/mug.h5") as shard:
+        np.testing.assert_array_equal(item.raw.numpy(), shard.raw(1, 1))
+        np.testing.assert_array_equal(item.normals.numpy(), shard.ground_truth(1, 2).normals)
+        assert item.celsius == shard.celsius(1, 1)
+    kept = item.raw.clone()
+    item.raw.zero_()
+    batch = data[[10, 3]]
+    assert torch.equal(batch.raw[0], kept)
+    assert batch.raw.dtype == torch.uint16
+    assert torch.equal(torch.nan_to_num(batch.depth[1]), torch.nan_to_num(data[3].depth))
+    assert len(ShardDataset(dataset, "train", cache if packed else None, frames=1)) == 4
+    data.close()
+    assert torch.equal(data[10].raw, kept)
+    data.close()
 
 
-def test_a_reader_in_use_goes_to_a_spawned_worker(dataset, tmp_path):
-    """Shards and caches that were read from here pickle, and give the same there."""
-    packed, shard = pack(dataset, "train", tmp_path / "cache")["mug"], ShardReader(dataset / "shards/mug.h5")
-    expected = read_all(shard)
-    assert (read_all(packed) == expected).all()
-    assert (read_all(pickle.loads(pickle.dumps(packed))) == expected).all()  # noqa: S301
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        for found in pool.map(read_all, [shard, packed]):
-            assert (found == expected).all()
-    packed.close()
-    assert (read_all(packed) == expected).all()
-    shard.close()
+class Both(torch.utils.data.Dataset):
+    """The same frames from shards and from a cache."""
+
+    def __init__(self, *parts):
+        self.parts = parts
+
+    def __getitem__(self, indices):
+        return [part[indices] for part in self.parts]
+
+
+def test_spawned_workers_read_for_themselves(dataset, tmp_path):
+    """A dataset in use pickles; spawned workers give every frame once, as batches, in order, from shards and cache."""
+    pack(dataset, "train", tmp_path / "cache")
+    shards, cached = ShardDataset(dataset, "train"), ShardDataset(dataset, "train", tmp_path / "cache")
+    expected = torch.stack([shards[i].raw.int() for i in range(12)])
+    assert torch.equal(pickle.loads(pickle.dumps(shards))[4].raw.int(), expected[4])  # noqa: S301
+    loader = DataLoader(
+        Both(shards, cached),
+        batch_size=None,
+        sampler=BatchSampler(SequentialSampler(shards), 5, drop_last=False),
+        num_workers=1,
+        multiprocessing_context=multiprocessing.get_context("spawn"),
+    )
+    batches = list(loader)
+    for part in (0, 1):
+        assert torch.equal(torch.cat([batch[part].raw.int() for batch in batches]), expected)
+    plain = DataLoader(cached, batch_size=4, sampler=RandomSampler(cached))
+    assert sum(len(batch.raw) for batch in plain) == 12
+    shards.close()

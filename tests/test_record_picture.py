@@ -10,8 +10,9 @@ import pytest
 from tests.test_plan import RIG, STAGE, UR10E
 from tofcapture.cli import main
 from tofcapture.errors import BusyError, DeviceError
+from tofcapture.record.candidates import REFUSALS, REMEDIES, object_sampling
 from tofcapture.record.daemon import client
-from tofcapture.record.plan import FATES, REMEDIES, object_sampling, plan_views
+from tofcapture.record.plan import plan_views
 from tofcapture.viz.plan import write_plan
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -68,13 +69,13 @@ def _start(group):
     return [float(x) for x in group.find(f"{SVG}path").get("d").split()[1:3]]
 
 
-def test_fates_and_counts_agree():
+def test_refusals_and_counts_agree():
     """What became of the candidates adds up to the counts, and no view stands where something stood against it."""
     plan = _plan()
-    fates = plan.tried.fates
-    assert {fate: int((fates == i).sum()) for i, fate in enumerate(FATES)} == plan.refused
-    assert len(fates) == plan.candidates == 240
-    free = plan.tried.spots[fates < 0]
+    refusal = plan.tried.refusal
+    assert {name: int((refusal == i).sum()) for i, name in enumerate(REFUSALS)} == plan.refused
+    assert len(refusal) == plan.candidates == 240
+    free = plan.tried.spots[refusal < 0]
     for view in plan.views:
         spot = STAGE.target + view.distance * view.direction
         assert np.linalg.norm(free - spot, axis=1).min() < 1e-9

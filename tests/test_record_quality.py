@@ -14,7 +14,7 @@ from tofcapture.files.view import read_view, view_path
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
 from tofcapture.poses import rotation_exp, transform
 from tofcapture.record.journal import Journal
-from tofcapture.record.quality import CHECKS, NOTE, REFUSE, RETAKE, judge, measure, record_of, sentence
+from tofcapture.record.quality import LIMITS, NOTE, REFUSE, RETAKE, broken_limits, measure, quality_table
 from tofcapture.rig import Rig
 
 __all__ = ["_few_candidates"]  # applies here too
@@ -52,15 +52,15 @@ def _raw(tof, change):
 
 
 def _failing(parts):
-    return {check.name for check in judge(measure(**parts))}
+    return {check.name for check in broken_limits(measure(**parts))}
 
 
 def test_a_good_view_passes():
     """Nothing is said about a good view, and every check has a number."""
     numbers = measure(**_good())
-    assert judge(numbers) == []
-    assert set(numbers) == {check.name for check in CHECKS}
-    assert record_of(numbers, [])["notes"] == []
+    assert broken_limits(numbers) == []
+    assert set(numbers) == {check.name for check in LIMITS}
+    assert quality_table(numbers)["notes"] == []
 
 
 def _flash(raw):
@@ -120,18 +120,18 @@ def test_dark_is_noted_and_unlit_is_refused():
     some = parts["tof"].raw.copy()
     some[..., :20, :] = faint[..., :20, :]
     assert _failing({**parts, "tof": replace(parts["tof"], raw=some)}) == {"dark"}
-    found = judge(measure(**{**parts, "tof": replace(parts["tof"], raw=faint)}))
+    found = broken_limits(measure(**{**parts, "tof": replace(parts["tof"], raw=faint)}))
     assert [check.action for check in found] == [REFUSE, NOTE]
 
 
 def test_refusals_come_first_and_speak():
     """The gravest failure is first; each has a sentence and a remedy."""
-    numbers = {check.name: 0.0 if check.least else 1e3 for check in CHECKS}
-    failed = judge(numbers)
-    assert len(failed) == len(CHECKS)
+    numbers = {check.name: 0.0 if check.least else 1e3 for check in LIMITS}
+    failed = broken_limits(numbers)
+    assert len(failed) == len(LIMITS)
     order = [check.action for check in failed]
     assert order == sorted(order, key=(REFUSE, RETAKE, NOTE).index)
-    assert all(sentence(check, numbers) and check.hint for check in failed)
+    assert all(check.sentence(numbers) and check.hint for check in failed)
 
 
 class Lamp(Bench):
@@ -209,6 +209,7 @@ class Turner(Bench):
 
     def station(self):
         station = super().station()
+        station.operator.can_turn = True
         station.operator.turn = lambda scene, angle: self._step(f"turn {round(np.degrees(angle))}")
         return station
 
@@ -255,5 +256,5 @@ def test_a_burst_of_one_frame():
     tof = parts["tof"]
     one = replace(tof, raw=tof.raw[:1], time_ns=tof.time_ns[:1], celsius=tof.celsius[:1])
     numbers = measure(**{**parts, "tof": one, "frames": 1})
-    assert judge(numbers) == []
-    assert set(numbers) == {check.name for check in CHECKS} - {"flicker"}
+    assert broken_limits(numbers) == []
+    assert set(numbers) == {check.name for check in LIMITS} - {"flicker"}

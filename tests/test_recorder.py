@@ -16,10 +16,12 @@ from tofcapture.errors import BusyError, ConfigError, DataError, DeviceError, Mo
 from tofcapture.files.view import read_view, view_path
 from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
 from tofcapture.poses import transform
-from tofcapture.record import recorder, scene_plan
-from tofcapture.record.journal import Journal, hold, journal_path
+from tofcapture.record import plan as plans
+from tofcapture.record import recorder, resources
+from tofcapture.record.journal import Journal, journal_path
 from tofcapture.record.plan import object_sampling
 from tofcapture.record.recorder import record
+from tofcapture.record.resources import hold_recording
 from tofcapture.rig import Rig
 
 TOF, STEREO = Camera(8, 6, 7.0, 7.0, 3.5, 2.5), Camera(10, 8, 9.0, 9.0, 4.5, 3.5)
@@ -57,6 +59,7 @@ class Bench:
 
 class _Role:
     simulated = True
+    can_turn = False
 
     def __init__(self, bench, role):
         self.bench, self.role = bench, role
@@ -102,7 +105,7 @@ def _few_candidates(monkeypatch):
     """Plan from few candidates: these tests are about recording."""
     sampling = object_sampling()
     few = type(sampling)(sampling.axis, directions=40, distances=(0.5, 0.8))
-    monkeypatch.setattr(scene_plan, "object_sampling", lambda: few)
+    monkeypatch.setattr(plans, "object_sampling", lambda: few)
 
 
 def _record(out, bench=None, scene="mug", views=VIEWS, frames=FRAMES, **options):
@@ -255,7 +258,7 @@ def test_other_cameras_are_refused(tmp_path):
 def test_only_one_recorder(tmp_path):
     """A second recorder of the same recording is told to wait, and who holds it."""
     tmp_path.mkdir(exist_ok=True)
-    with hold(tmp_path), pytest.raises(BusyError, match=str(os.getpid())):
+    with hold_recording(tmp_path), pytest.raises(BusyError, match=str(os.getpid())):
         _record(tmp_path)
     assert _record(tmp_path).recorded == tuple(range(VIEWS))
 
@@ -331,7 +334,7 @@ def test_full_disk_and_wrong_wishes_are_refused(tmp_path, monkeypatch):
         _record(tmp_path, bench, frames=0)
     with pytest.raises(ConfigError, match="scene"):
         _record(tmp_path, bench, scene="../up")
-    monkeypatch.setattr(recorder.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1e6})())
+    monkeypatch.setattr(resources.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1e6})())
     with pytest.raises(ConfigError, match="free disk"):
         _record(tmp_path, bench)
     assert bench.steps == []

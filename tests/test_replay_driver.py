@@ -17,7 +17,7 @@ from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 from tofcapture.files.view import read_view, view_path
 from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth
 from tofcapture.poses import transform
-from tofcapture.record import scene_plan
+from tofcapture.record import plan as plans
 from tofcapture.record.plan import object_sampling
 from tofcapture.record.recorder import record
 from tofcapture.rig import Rig
@@ -112,7 +112,7 @@ def recording(tmp_path_factory):
 def few_candidates(patch):
     sampling = object_sampling()
     patch.setattr(
-        scene_plan,
+        plans,
         "object_sampling",
         lambda: type(sampling)(sampling.axis, directions=40, distances=(0.5, 0.8)),
     )

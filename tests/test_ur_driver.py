@@ -14,8 +14,8 @@ from tofcapture.devices.station import open_station
 from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.files.view import read_view, view_path
 from tofcapture.record import recorder
+from tofcapture.record.plan import plan_scene
 from tofcapture.record.recorder import record
-from tofcapture.record.scene_plan import plan_scene
 from tofcapture.testing import check_arm
 
 pytest.importorskip("rtde_control", reason="the ur_rtde library is not installed")
@@ -126,7 +126,7 @@ def test_a_whole_scene(emulator, tmp_path):
     with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
         result = record(station, "mug", tmp_path / "recording", views=25, frames=1)
     assert len(result.recorded) == len(result.plan.views) == 25
-    assert json.dumps(result.plan.table())
+    assert json.dumps(result.plan.as_json())
 
 
 @pytest.mark.slow

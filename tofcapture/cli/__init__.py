@@ -33,6 +33,7 @@ ORDER = (
     "calibrate",
     "build-dataset",
     "check",
+    "migrate",
     "stats",
     "view",
     "figure",

@@ -31,16 +31,16 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> Outcome:
-    from tofcapture.record.daemon.state import open_folder
-    from tofcapture.record.daemon.systemd import unit
+    from tofcapture.record.daemon.settings import Settings, open_folder
 
     state = open_folder(args.state)
     if args.print_unit:
+        from tofcapture.record.daemon.server import unit
+
         text = unit(args.root, state.root)
         return Outcome(data={"ok": True, "unit": text}, text=text)
     from tofcapture.devices.station import read_station
     from tofcapture.record.daemon.server import serve, tcp_address
-    from tofcapture.record.daemon.settings import Settings
 
     http = tcp_address(args.http) if args.http else None
     named = station_path(args.station)[0]

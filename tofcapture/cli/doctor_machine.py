@@ -184,10 +184,10 @@ def check_ports(dev: Path = Path("/dev")) -> list[Finding]:
 def check_daemon() -> list[Finding]:
     """The daemon's folder: ours alone, its socket's path short enough; and whether one runs."""
     from tofcapture.record.daemon.client import ask
-    from tofcapture.record.daemon.state import StateFolder, default_folder
+    from tofcapture.record.daemon.settings import state_folder
 
-    state = StateFolder(default_folder().absolute())
-    if len(os.fsencode(state.socket)) > 107:
+    state = state_folder(None)
+    if not state.socket_fits:
         advice = "set TOFCAPTURE_STATE to a shorter folder"
         return [Finding("daemon folder", "WARN", f"{state.socket} is too long for a socket", advice)]
     near = next(p for p in (state.root, *state.root.parents) if p.exists())

@@ -76,8 +76,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> Outcome:
     from tofcapture.devices.station import open_station
     from tofcapture.frames import CALIBRATION
+    from tofcapture.record.plan import plan_scene
     from tofcapture.record.recorder import record
-    from tofcapture.record.scene_plan import plan_scene
 
     scene = CALIBRATION if args.calibration else args.scene
     args.station = station_path(args.station)[0]
@@ -156,7 +156,7 @@ def _planned(args: argparse.Namespace, scene: str, station: Station, plan: Plan)
     picture.parent.mkdir(parents=True, exist_ok=True)
     write_plan(plan, stage, station.rig, target, title, picture)
     return Outcome(
-        data={"ok": True, "scene": scene, "plan": plan.table(), "picture": str(picture)},
+        data={"ok": True, "scene": scene, "plan": plan.as_json(), "picture": str(picture)},
         text="\n".join([plan.summary(), *_plan_rows(plan), *plan.shortfall(), f"drawn in {picture}"]),
     )
 

@@ -54,6 +54,11 @@ class Station:
         return int(self.config.get("sim", {}).get("seed", 0))
 
     @property
+    def world(self) -> dict[str, Any]:
+        """What a simulated world is made of; faults on demand come and go without making it another."""
+        return {key: value for key, value in self.config.get("sim", {}).items() if key != "faults"}
+
+    @property
     def simulated(self) -> bool:
         """True when no real arm moves."""
         return self.arm.simulated

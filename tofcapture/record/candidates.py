@@ -14,8 +14,6 @@ from tofcapture.rig import Rig
 
 Bools = NDArray[np.bool_]
 
-# Why a candidate is no view; the number of a fate is its place here.
-FATES = ("reach", *REASONS, "mixed", "way from home")
 REMEDIES = {
     "reach": (
         "beyond the arm's reach",
@@ -34,8 +32,9 @@ REMEDIES = {
     ),
     "way from home": ("not to be reached from home in a straight way", "choose another home ([plan] home)"),
 }
-"""Words for each of :data:`FATES`, and what would help."""
-BRANCH = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.25])  # weight of each joint in "close to home" and in travel
+"""Why a candidate is no view, in words, and what would help."""
+REFUSALS = tuple(REMEDIES)  # the number of a refusal is its place here
+JOINT_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.25])  # in "close to home" and in travel
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Sampling:
     directions, rolls
         How many of each are tried; of the rolls, the one nearest to home is kept.
     lean
-        How much, in radians, it counts that the axis leans in another direction of the image; zero where rolls do not matter.
+        How much it counts, in radians, that the axis leans in another direction of the image.
     """
 
     axis: Float64
@@ -68,14 +67,14 @@ class Sampling:
 
 
 def object_sampling() -> Sampling:
-    """All around the vertical, 0.35 to 1.5 m."""
+    """Sample all around the vertical, 0.35 to 1.5 m away."""
     return Sampling(axis=np.array([0.0, 0.0, 1.0]))
 
 
 def board_sampling(stage: Stage) -> Sampling:
-    """Tilts of 15 to 40 deg to the board's normal in all directions, of the room and of the image, 0.5 to 1 m.
+    """Sample tilts of 15 to 40 deg to the board's normal in all directions, 0.5 to 1 m away.
 
-    One roll for each candidate, at random: were the one nearest to home taken, the board would lean the same way in most images.
+    Each candidate has one random roll. The roll nearest to home would lean the board the same way in most images.
     """
     return Sampling(
         stage.board_normal,
@@ -89,7 +88,7 @@ def board_sampling(stage: Stage) -> Sampling:
 
 
 def candidates(sampling: Sampling, rng: np.random.Generator) -> tuple[Float64, Float64]:
-    """Directions (C, 3) on a Fibonacci spiral about the axis, each at all distances (C,), jittered by up to 8 %."""
+    """Spread directions (C, 3) on a Fibonacci spiral, each at all distances (C,), jittered by up to 8 %."""
     n = sampling.directions
     low, high = np.cos(sampling.tilt[0]), np.cos(sampling.tilt[1])
     cosine = low + (high - low) * (np.arange(n) + 0.5) / n
@@ -110,7 +109,7 @@ def flange_poses(
     distances: Float64,
     rng: np.random.Generator,
 ) -> Float64:
-    """(C, rolls, 4, 4) flange poses from which the ToF camera looks at the target, one per roll."""
+    """Find flange poses (C, rolls, 4, 4) from which the ToF camera looks at the target."""
     spots = target + rng.uniform(-sampling.aim, sampling.aim, directions.shape)
     rolls = 2 * np.pi * (np.arange(sampling.rolls) / sampling.rolls) + rng.uniform(
         0, 2 * np.pi, (len(spots), 1)
@@ -125,17 +124,25 @@ def flange_poses(
 
 
 def leans(rig: Rig, axis: Float64, T_base_flange: Float64) -> Float64:
-    """Directions (C, 2), unit, in which the axis leans in the ToF image."""
+    """Find unit directions (C, 2) in which the axis leans in the ToF image."""
     T_base_tof = T_base_flange @ rig.T_flange_tof
     lean = np.swapaxes(T_base_tof[:, :3, :2], 1, 2) @ axis
     out: Float64 = lean / np.maximum(np.linalg.norm(lean, axis=1, keepdims=True), 1e-9)
     return out
 
 
-def branches(
+def hold_poses(
     model: ArmModel, rig: Rig, stage: Stage, T_base_flange: Float64
 ) -> tuple[Float64, NDArray[np.int8]]:
-    """(C, 6) of the clear branch and roll nearest to home, NaN where there is none; (C,) what stood in the way."""
+    """Find joints that hold flange poses (C, rolls, 4, 4) and meet nothing.
+
+    Returns
+    -------
+    joints
+        (C, 6) of the clear solution and roll nearest to home, NaN where there is none.
+    refusal
+        (C,) index into :data:`REFUSALS` of what stood in the way, -1 for nothing.
+    """
     count = len(T_base_flange)
     q = stage.home + wrap(inverse_all(model, T_base_flange) - stage.home)
     q = q.reshape(count, -1, 6)
@@ -143,20 +150,20 @@ def branches(
     hits = np.zeros((*reached.shape, len(REASONS)), dtype=bool)
     hits[reached] = obstacles(model, rig, stage, q[reached])
     clear: Bools = reached & ~np.any(hits, axis=-1)
-    cost = np.where(clear, (BRANCH * np.nan_to_num(q - stage.home) ** 2).sum(axis=-1), np.inf)
+    cost = np.where(clear, (JOINT_WEIGHTS * np.nan_to_num(q - stage.home) ** 2).sum(axis=-1), np.inf)
     best = q[np.arange(count), cost.argmin(axis=1)]
     lost: Bools = ~np.any(clear, axis=1)
     # Rounded to a millionth, goals are the same on machines whose last bits differ.
-    return np.where(lost[:, None], np.nan, np.round(best, 6)), _fates(reached, hits, lost)
+    return np.where(lost[:, None], np.nan, np.round(best, 6)), _refusals(reached, hits, lost)
 
 
-def _fates(reached: Bools, hits: Bools, lost: Bools) -> NDArray[np.int8]:
-    """(C,) for each lost candidate the first reason that stands against all of its branches, else ``mixed``; -1 for the others."""
-    out = np.where(reached.any(axis=1), -1, FATES.index("reach")).astype(np.int8)
+def _refusals(reached: Bools, hits: Bools, lost: Bools) -> NDArray[np.int8]:
+    """Name for each lost candidate the first obstacle of all its solutions, else ``mixed``."""
+    out = np.where(reached.any(axis=1), -1, REFUSALS.index("reach")).astype(np.int8)
     left = lost & reached.any(axis=1)
     for i, reason in enumerate(REASONS):
         always = left & (hits[..., i] | ~reached).all(axis=1)
-        out[always] = FATES.index(reason)
+        out[always] = REFUSALS.index(reason)
         left &= ~always
-    out[left] = FATES.index("mixed")
+    out[left] = REFUSALS.index("mixed")
     return out

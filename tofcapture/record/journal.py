@@ -1,28 +1,21 @@
-"""The recording's journal: one row per view, in SQLite; who writes it holds the recording.
+"""The recording's journal: one row per view, in SQLite.
 
-The journal says what should be there and what is; the sealed files themselves are the truth, and ``record.reconcile`` makes the
-journal agree with them.
+The journal says what should be there and what is. The sealed files themselves are the truth, and ``record.reconcile`` makes
+the journal agree with them.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
 import sqlite3
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from tofcapture.errors import BusyError, ConfigError, DataError
-from tofcapture.record.watch import is_full
-
-if TYPE_CHECKING:
-    from tofcapture.devices import Arm
+from tofcapture.errors import ConfigError, DataError
+from tofcapture.record.resources import is_full
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS views (
@@ -34,8 +27,6 @@ CREATE TABLE IF NOT EXISTS views (
 );
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 """
-
-
 _PLAN = """
 INSERT INTO views (scene, "index", pose, state, planned_utc, changed_utc) VALUES (?, ?, ?, 'planned', ?, ?)
 ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'planned', step = '', changed_utc = excluded.changed_utc WHERE state != 'sealed'
@@ -47,10 +38,11 @@ ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'sealed', sha256 = exclu
 
 
 @dataclass(frozen=True)
-class Row:
+class JournalRow:
     """What the journal says of one view.
 
-    ``pose`` is the planned view's digest, ``step`` what was begun last for a view that is not sealed (``record.watch.STEPS``).
+    ``pose`` is the planned view's digest, ``step`` what was begun last for a view that is not sealed
+    (``record.observer.STEPS``).
     """
 
     scene: str
@@ -60,11 +52,11 @@ class Row:
     sha256: str | None
     attempts: int
     reason: str
-    step: str = ""
+    step: str
 
 
 def utc_now() -> str:
-    """Time of day as the journal and the files write it: ISO 8601, UTC, whole seconds."""
+    """Give the time of day as files have it: ISO 8601, UTC, whole seconds."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
@@ -73,62 +65,24 @@ def journal_path(recording: Path) -> Path:
     return Path(recording) / "journal.sqlite"
 
 
-@contextmanager
-def hold(recording: Path) -> Iterator[None]:
-    """Hold a recording for writing; the lock goes with the process, however that ends.
+def open_database(path: Path, schema: str, what: str, hint: str) -> sqlite3.Connection:
+    """Open an SQLite database whose every transaction is on disk when its call returns.
 
     Raises
     ------
-    BusyError
-        When another recorder holds it.
+    DataError
+        The file is no such database.
     """
-    import fcntl
-
-    # Not the database itself: closing any handle of it would drop SQLite's own locks.
-    with (recording / ".lock").open("a+", encoding="ascii") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as err:
-            file.seek(0)
-            holder = file.read().strip() or "unknown"
-            raise BusyError(
-                f"{recording}: another recorder (process {holder}) is at work", hint="wait for it to end"
-            ) from err
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
-        yield
-
-
-@contextmanager
-def hold_arm(arm: Arm) -> Iterator[None]:
-    """Hold a real arm for this process: two recorders of two recordings must not move it in turn.
-
-    Raises
-    ------
-    BusyError
-        When another process of this machine moves it.
-    """
-    import fcntl
-
-    if arm.simulated:
-        yield
-        return
-    info = arm.describe()
-    name = hashlib.sha256(f"{info.model}|{info.serial}".encode()).hexdigest()[:16]
-    path = Path(tempfile.gettempdir()) / f"tofcapture-arm-{name}.lock"
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-    except PermissionError:  # another user's file in a sticky folder can be locked, but not created
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    with os.fdopen(handle):
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as err:
-            raise BusyError(
-                f"the arm {info.model} {info.serial} is moved by another process", hint="tofcapture status"
-            ) from err
-        yield
+        db = sqlite3.connect(path, isolation_level=None)
+        db.execute("PRAGMA journal_mode=WAL")
+        db.execute("PRAGMA synchronous=FULL")
+        db.executescript(schema)
+    except sqlite3.DatabaseError as err:
+        if is_full(err):
+            raise
+        raise DataError(f"{path}: not {what}: {err}", hint=hint) from err
+    return db
 
 
 class Journal:
@@ -141,50 +95,29 @@ class Journal:
     """
 
     def __init__(self, recording: Path) -> None:
-        path = journal_path(recording)
-        try:
-            self._db = sqlite3.connect(path, isolation_level=None)
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=FULL")
-            self._db.executescript(_SCHEMA)
-            self._grow()
-        except sqlite3.DatabaseError as err:
-            if is_full(err):
-                raise
-            raise DataError(
-                f"{path}: not a journal: {err}", hint="move it away: it is rebuilt from the view files"
-            ) from err
-
-    def _grow(self) -> None:
-        """Add what journals of earlier versions lack."""
-        if "step" not in {row[1] for row in self._db.execute("PRAGMA table_info(views)")}:
-            self._db.execute("ALTER TABLE views ADD COLUMN step TEXT NOT NULL DEFAULT ''")
+        hint = "move it away: it is rebuilt from the view files"
+        self._db = open_database(journal_path(recording), _SCHEMA, "a journal", hint)
 
     def close(self) -> None:
         """Close the database."""
         self._db.close()
 
-    def rows(self, scene: str | None = None) -> list[Row]:
+    def rows(self, scene: str | None = None) -> list[JournalRow]:
         """All rows, or those of one scene, by scene and number."""
         where, values = ("WHERE scene = ?", (scene,)) if scene else ("", ())
         found = self._db.execute(
             f'SELECT scene, "index", pose, state, sha256, attempts, reason, step FROM views {where} ORDER BY scene, "index"',  # noqa: S608
             values,
         )
-        return [Row(*row) for row in found]
+        return [JournalRow(*row) for row in found]
 
     def agree(self, facts: Mapping[str, Any]) -> None:
-        """Remember facts of the recording, or compare with the remembered ones.
-
-        Parameters
-        ----------
-        facts
-            Name -> JSON types: cameras, frames per burst ...
+        """Remember facts of the recording (name -> JSON types), or compare with the remembered ones.
 
         Raises
         ------
         ConfigError
-            When a fact differs from what the recording was begun with.
+            A fact differs from what the recording was begun with.
         """
         for key, value in facts.items():
             text = json.dumps(value, sort_keys=True)
@@ -202,7 +135,7 @@ class Journal:
         Raises
         ------
         ConfigError
-            When a view of that number was recorded at another pose.
+            A view of that number was recorded at another pose.
         """
         sealed = {row.index: row.pose for row in self.rows(scene) if row.state == "sealed"}
         for index in sorted(sealed.keys() & poses.keys()):

@@ -1,10 +1,8 @@
 """Which views to take of a scene: spread over directions and distances, reachable, clear of everything.
 
-A UR arm reaches far fewer views than one expects (a UR10e half of those 1.4 m away), so the plan offers thousands of candidates,
-keeps what is reachable and clear at the goal and on the straight way from home, and picks from them by farthest-point sampling
-over direction and distance. Sampling is greedy: the first 10 of 25 views are the 10 of a plan for 10, so a recording can be
-extended. Where the arm sees an object from one side only, a person may turn the object: directions are then told apart as the
-object sees them.
+A UR arm reaches far fewer views than one expects. The plan tries thousands of candidates and keeps those that are clear, at
+the goal and on the straight way from home. It picks from them by greedy farthest-point sampling over direction and
+distance: 10 views are the first 10 of 25, so a recording can be extended. A person may turn the object between views.
 """
 
 from __future__ import annotations
@@ -17,38 +15,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices.clearance import Stage, is_clear
-from tofcapture.devices.kinematics import ArmModel, forward
+from tofcapture.devices.clearance import Stage, is_clear, stage_of
+from tofcapture.devices.kinematics import ArmModel, arm_model, forward
+from tofcapture.devices.station import Station
+from tofcapture.errors import ConfigError
+from tofcapture.files.view import check_scene_name
+from tofcapture.frames import CALIBRATION
 from tofcapture.poses import Float64, rotate_vectors
 from tofcapture.record.candidates import (
-    BRANCH,
-    FATES,
+    JOINT_WEIGHTS,
+    REFUSALS,
     REMEDIES,
     Bools,
     Sampling,
     board_sampling,
-    branches,
     candidates,
     flange_poses,
+    hold_poses,
     leans,
     object_sampling,
 )
 from tofcapture.rig import Rig
 
-__all__ = [
-    "FATES",
-    "REMEDIES",
-    "Plan",
-    "PlannedView",
-    "Sampling",
-    "Tried",
-    "board_sampling",
-    "object_sampling",
-    "plan_views",
-]
-
 _LOG_DISTANCE = 0.6  # rad per e-fold of distance: how much a nearer view counts against a turned one
 _FEW = 24  # candidates that each pick of the sampling chooses among
+_MOST_TURNS = 36
 
 
 @dataclass(frozen=True)
@@ -58,7 +49,7 @@ class PlannedView:
     Attributes
     ----------
     index
-        Number of the view: its rank in the sampling, not its turn.
+        Number of the view: its rank in the sampling, not in the order of travel.
     joints
         (6,) goal, radians.
     T_base_flange
@@ -68,7 +59,7 @@ class PlannedView:
     direction
         (3,) unit, from the target to the camera, base frame.
     turn
-        How far the object has been turned about the vertical by then, counter-clockwise seen from above, radians.
+        Turn of the object about the vertical by then, counter-clockwise seen from above, radians.
     """
 
     index: int
@@ -80,25 +71,30 @@ class PlannedView:
 
     @property
     def digest(self) -> str:
-        """Names the pose, of the arm and of the object; a view of another digest is another view."""
+        """Name the pose of arm and object: a view of another digest is another view."""
         numbers = np.append(self.joints, self.turn) if self.turn else self.joints
         return hashlib.sha256((np.round(numbers, 6) + 0.0).tobytes()).hexdigest()[:16]
+
+    def as_json(self) -> dict[str, Any]:
+        """Write the view as JSON types."""
+        return {
+            "index": self.index,
+            "joints": self.joints.tolist(),
+            "distance": self.distance,
+            "direction": self.direction.tolist(),
+            "turn_deg": round(float(np.degrees(self.turn)), 6),
+        }
 
 
 @dataclass(frozen=True)
 class Tried:
-    """What became of the candidates.
+    """Candidates: where the camera would stand ``spots`` (C, 3), base frame, metres, and ``refusal`` (C,).
 
-    Attributes
-    ----------
-    spots
-        (C, 3) where the ToF camera would stand, base frame, metres.
-    fates
-        (C,) int, index into :data:`FATES` of what stood against it, -1 for nothing.
+    A refusal is an index into :data:`REFUSALS`, -1 for a candidate that nothing stands against.
     """
 
     spots: Float64
-    fates: NDArray[np.int8]
+    refusal: NDArray[np.int8]
 
 
 @dataclass(frozen=True)
@@ -109,13 +105,10 @@ class Plan:
     ----------
     views
         In the order to visit them.
-    wanted
-        How many were asked for.
-    candidates
-        How many were tried.
+    wanted, candidates
+        How many were asked for, and how many were tried.
     refused
-        Reason -> number of candidates: ``reach``; those of :data:`clearance.REASONS`; ``mixed``, no branch clear for one
-        reason alone; ``way from home``, of the candidates that sampling came upon.
+        Number of candidates for each of :data:`REFUSALS`; ``way from home`` counts those that sampling came upon.
     tried
         The candidates themselves, for the picture.
     """
@@ -128,12 +121,12 @@ class Plan:
 
     @property
     def digest(self) -> str:
-        """Names the whole plan, whatever the order of travel."""
+        """Name the whole plan, whatever the order of travel."""
         ordered = sorted(self.views, key=lambda v: v.index)
         return hashlib.sha256("".join(v.digest for v in ordered).encode()).hexdigest()[:16]
 
     def summary(self) -> str:
-        """One line: how many views, of how many candidates, and what stood against the others."""
+        """Say in one line how many views there are, and what stood against the other candidates."""
         refused = ", ".join(f"{count} {reason}" for reason, count in self.refused.items() if count)
         return f"{len(self.views)} of {self.wanted} views; {self.candidates} candidates, refused: {refused or 'none'}"
 
@@ -141,31 +134,52 @@ class Plan:
         """Say why there are fewer views than wanted, the commonest reason first; nothing when there are enough."""
         if len(self.views) >= self.wanted:
             return []
-        counts = sorted(((n, fate) for fate, n in self.refused.items() if n), reverse=True)
+        counts = sorted(((n, reason) for reason, n in self.refused.items() if n), reverse=True)
         lines = [
             f"only {len(self.views)} of {self.wanted} views can be taken, of {self.candidates} candidates"
         ]
-        lines += [f"  {n} are {REMEDIES[fate][0]}: {REMEDIES[fate][1]}" for n, fate in counts]
+        lines += [f"  {n} are {REMEDIES[reason][0]}: {REMEDIES[reason][1]}" for n, reason in counts]
         return [*lines, "  or have the object turned between views: --turns 4"]
 
-    def table(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """Write the plan as JSON types."""
-        return {
-            "digest": self.digest,
-            "wanted": self.wanted,
-            "candidates": self.candidates,
-            "refused": self.refused,
-            "views": [
-                {
-                    "index": v.index,
-                    "joints": v.joints.tolist(),
-                    "distance": v.distance,
-                    "direction": v.direction.tolist(),
-                    "turn_deg": round(float(np.degrees(v.turn)), 6),
-                }
-                for v in self.views
-            ],
-        }
+        views = [view.as_json() for view in self.views]
+        numbers = {"wanted": self.wanted, "candidates": self.candidates, "refused": self.refused}
+        return {"digest": self.digest, **numbers, "views": views}
+
+
+def plan_scene(station: Station, scene: str, views: int, turns: int = 1) -> Plan:
+    """Plan the views of a scene on a station: its arm, its rig, its ``[plan]``, its seed.
+
+    Raises
+    ------
+    ConfigError
+        The name is no safe file name, no view is wanted, the board shall be turned, or not one view can be reached.
+    """
+    check_scene_name(scene)
+    if views < 1:
+        raise ConfigError(f"views: expected at least 1, got {views}")
+    stage, board = stage_of(station.config), scene == CALIBRATION
+    if not 1 <= turns <= (1 if board else _MOST_TURNS):
+        limit = "the board stays as it stands" if board else f"expected 1 to {_MOST_TURNS}"
+        raise ConfigError(f"turns: {limit}, got {turns}")
+    digest = hashlib.sha256(f"plan|{station.seed}|{scene}".encode()).digest()
+    plan = plan_views(
+        arm_model(station.arm.describe().model),
+        station.rig,
+        stage,
+        stage.board if board else stage.target,
+        board_sampling(stage) if board else object_sampling(),
+        views,
+        np.random.default_rng(np.frombuffer(digest, dtype="<u4").tolist()),
+        turns,
+    )
+    if not plan.views:
+        raise ConfigError(
+            f"no view of {scene!r} can be taken: {plan.summary()}",
+            hint="move the target, see [plan] of the station",
+        )
+    return plan
 
 
 def plan_views(
@@ -178,7 +192,7 @@ def plan_views(
     rng: np.random.Generator,
     turns: int = 1,
 ) -> Plan:
-    """Plan the views of one scene.
+    """Plan views of a target.
 
     Parameters
     ----------
@@ -191,19 +205,18 @@ def plan_views(
     views
         How many are wanted.
     rng
-        Turns and jitters the candidates, so that scenes differ; the same generator gives the same plan.
+        Turns and jitters the candidates; the same generator gives the same plan.
     turns
-        In how many ways the object is put on the table, a full turn divided by this apart. Views of one turn are taken one after
-        the other.
+        In how many ways the object is put on the table, a full turn divided by this apart.
 
     Returns
     -------
     Plan
-        With fewer views than wanted where the arm reaches no more.
+        With fewer views than wanted where the arm reaches no more. Views of one turn follow each other.
     """
     directions, distances = candidates(sampling, rng)
     T_base_flange = flange_poses(rig, target, sampling, directions, distances, rng)
-    joints, fates = branches(model, rig, stage, T_base_flange)
+    joints, refusal = hold_poses(model, rig, stage, T_base_flange)
     count = len(joints)
     angles = 2 * np.pi * np.arange(turns) / turns
     seen = np.concatenate([rotate_vectors(_about_vertical(-angle), directions) for angle in angles])
@@ -215,16 +228,16 @@ def plan_views(
     def accept(k: int) -> bool:
         clear = is_clear(model, rig, stage, stage.home, joints[k % count])
         if not clear:
-            fates[k % count] = FATES.index("way from home")
+            refusal[k % count] = REFUSALS.index("way from home")
         return clear
 
-    chosen = _spread(features, np.tile(fates < 0, turns), views, accept, rng)
+    chosen = _spread(features, np.tile(refusal < 0, turns), views, accept, rng)
     planned = [
         PlannedView(i, joints[c], forward(model, joints[c]), float(distances[c]), directions[c], angle)
         for i, c, angle in ((i, k % count, float(angles[k // count])) for i, k in enumerate(chosen))
     ]
-    refused = {fate: int((fates == i).sum()) for i, fate in enumerate(FATES)}
-    tried = Tried(target + distances[:, None] * directions, fates)
+    refused = {reason: int((refusal == i).sum()) for i, reason in enumerate(REFUSALS)}
+    tried = Tried(target + distances[:, None] * directions, refusal)
     return Plan(tuple(_by_travel(planned, stage.home)), views, count, refused, tried)
 
 
@@ -238,15 +251,11 @@ def _about_vertical(angle: float) -> Float64:
 
 
 def _spread(
-    features: Float64,
-    usable: Bools,
-    views: int,
-    accept: Callable[[int], bool],
-    rng: np.random.Generator,
+    features: Float64, usable: Bools, views: int, accept: Callable[[int], bool], rng: np.random.Generator
 ) -> list[int]:
-    """Farthest-point sampling (greedy, so that fewer views are a prefix of more).
+    """Pick by farthest-point sampling: greedy, so that fewer views are a prefix of more.
 
-    Every pick is the farthest of a few random candidates (Mitchell's best candidate): the farthest of all would put nearly
+    Every pick is the farthest of a few random candidates (Mitchell's best candidate). The farthest of all would put nearly
     every view on the rim of what the arm reaches.
     """
     left = np.flatnonzero(usable)
@@ -267,7 +276,9 @@ def _by_travel(views: Sequence[PlannedView], home: Float64) -> list[PlannedView]
     left, here, out = list(views), home, []
     while left:
         turn = min(v.turn for v in left)
-        costs = [float(np.abs(BRANCH * (v.joints - here)).max()) if v.turn == turn else np.inf for v in left]
+        costs = [
+            float(np.abs(JOINT_WEIGHTS * (v.joints - here)).max()) if v.turn == turn else np.inf for v in left
+        ]
         out.append(left.pop(int(np.argmin(costs))))
         here = out[-1].joints
     return out

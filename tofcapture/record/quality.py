@@ -1,12 +1,11 @@
-"""Is a view any good? Looked at while the rig still stands there, so that what another try can mend is taken again.
+"""Tell whether a view is any good, while the rig still stands there and another try can mend it.
 
-Every check is one number and a limit (:data:`CHECKS`). What is done about it depends on what a second try can do:
+Every check is one number and a limit (:data:`LIMITS`). What is done about it depends on what a second try can do:
 
 ``note``
-    A second try would show the same (a dark object, a mirror, a pose from which the cameras see different things): the view is
-    kept, and the note goes into its file.
+    A second try would show the same (a dark object, a mirror): the view is kept, the note goes into its file.
 ``retake``
-    A disturbance that may have passed (a lamp, a passing hand, a lost frame): taken again, three times in all, then kept with the note.
+    A disturbance that may have passed (a lamp, a lost frame): taken again, three times in all, then kept with the note.
 ``refuse``
     The data are not of this pose, or not there: taken again, three times in all, then the view is given up.
 """
@@ -35,118 +34,50 @@ _FAINT = 50.0  # raw units; changes of fainter blocks are told in parts of this
 
 
 @dataclass(frozen=True)
-class Check:
-    """A number of a view, and what it must not exceed.
+class Limit:
+    """Largest good value of a number of a view, or smallest where ``least``.
 
-    Attributes
-    ----------
-    name
-        Key of the number, in the file too.
-    limit
-        Largest good value; smallest where ``least``.
-    action
-        ``note``, ``retake`` or ``refuse``.
-    words
-        What is wrong, with the number as ``{0}``.
-    hint
-        What to do about it.
-    least
-        The number must not be smaller, instead of larger.
+    ``action`` is ``note``, ``retake`` or ``refuse``. ``words`` say what is wrong, with the number as ``{0}``, ``hint`` what
+    to do about it. ``name`` is the number's key, in the file too.
     """
 
     name: str
-    limit: float
+    value: float
     action: str
     words: str
     hint: str
     least: bool = False
 
-    def fails(self, value: float) -> bool:
-        """Tell whether a number is on the wrong side; one that could not be found is not."""
-        return value < self.limit if self.least else value > self.limit
+    def broken_by(self, number: float) -> bool:
+        """Tell whether a number is on the wrong side; NaN is not."""
+        return number < self.value if self.least else number > self.value
+
+    def sentence(self, numbers: dict[str, float]) -> str:
+        """Say what is wrong with a view of these numbers."""
+        return self.words.format(numbers[self.name])
 
 
-CHECKS = (
-    Check(
-        "motion_m",
-        0.2e-3,
-        REFUSE,
-        "the arm moved by {0:.2g} m during the exposures",
-        "let it settle longer; look for vibration",
-    ),
-    Check(
-        "motion_deg",
-        0.02,
-        REFUSE,
-        "the arm moved by {0:.2g} deg during the exposures",
-        "let it settle longer; look for vibration",
-    ),
-    Check(
-        "missing_frames",
-        0,
-        REFUSE,
-        "{0:.0f} frames of the burst are missing",
-        "look at the link and the load of this machine",
-    ),
-    Check(
-        "stale_frames",
-        0,
-        REFUSE,
-        "{0:.0f} frames are older than the pose, out of order or repeated",
-        "the camera hands out old buffers: open the station anew",
-    ),
-    Check(
-        "unlit",
-        0.98,
-        REFUSE,
-        "{0:.0%} of the ToF image got no light back",
-        "is the illumination on, the lens cap off?",
-    ),
-    Check(
-        "stereo_coverage",
-        0.02,
-        REFUSE,
-        "the stereo camera measured {0:.1%} of its image",
-        "is its projector on, and the scene within its range?",
-        least=True,
-    ),
-    Check(
-        "frame_drops",
-        0,
-        RETAKE,
-        "{0:.0f} frames were dropped within the burst",
-        "look at the link and the load of this machine",
-    ),
-    Check(
-        "flicker",
-        0.03,
-        RETAKE,
-        "the light changed by {0:.1%} between the frames",
-        "keep people and lamps out of sight; shade the sun",
-    ),
-    Check(
-        "saturated",
-        0.05,
-        NOTE,
-        "{0:.0%} of the ToF pixels are saturated",
-        "shorten the exposure; dull what shines",
-    ),
-    Check(
-        "dark",
-        0.5,
-        NOTE,
-        "{0:.0%} of the ToF pixels are too dark for 20 mm",
-        "lengthen the exposure, come nearer, or leave such objects out",
-    ),
-    Check(
-        "overlap",
-        0.3,
-        NOTE,
-        "the stereo camera covers {0:.0%} of the ToF image",
-        "is the rig right, and the distance within the stereo camera's range?",
-        least=True,
-    ),
+_SETTLE = "let it settle longer; look for vibration"
+_LINK = "look at the link and the load of this machine"
+_BUFFERS = "the camera hands out old buffers: open the station anew"
+_PROJECTOR = "is its projector on, and the scene within its range?"
+_RANGE = "is the rig right, and the distance within the stereo camera's range?"
+_DULL = "lengthen the exposure, come nearer, or leave such objects out"
+# fmt: off
+LIMITS = (
+    Limit("motion_m", 0.2e-3, REFUSE, "the arm moved by {0:.2g} m during the exposures", _SETTLE),
+    Limit("motion_deg", 0.02, REFUSE, "the arm moved by {0:.2g} deg during the exposures", _SETTLE),
+    Limit("missing_frames", 0, REFUSE, "{0:.0f} frames of the burst are missing", _LINK),
+    Limit("stale_frames", 0, REFUSE, "{0:.0f} frames are older than the pose, out of order or repeated", _BUFFERS),
+    Limit("unlit", 0.98, REFUSE, "{0:.0%} of the ToF image got no light back", "is the illumination on, the lens cap off?"),
+    Limit("stereo_coverage", 0.02, REFUSE, "the stereo camera measured {0:.1%} of its image", _PROJECTOR, least=True),
+    Limit("frame_drops", 0, RETAKE, "{0:.0f} frames were dropped within the burst", _LINK),
+    Limit("flicker", 0.03, RETAKE, "the light changed by {0:.1%} between the frames", "keep people and lamps out of sight; shade the sun"),
+    Limit("saturated", 0.05, NOTE, "{0:.0%} of the ToF pixels are saturated", "shorten the exposure; dull what shines"),
+    Limit("dark", 0.5, NOTE, "{0:.0%} of the ToF pixels are too dark for 20 mm", _DULL),
+    Limit("overlap", 0.3, NOTE, "the stereo camera covers {0:.0%} of the ToF image", _RANGE, least=True),
 )
+# fmt: on
 
 
 def measure(
@@ -167,7 +98,7 @@ def measure(
 
     Returns
     -------
-    One number for each of :data:`CHECKS`, by name; ``flicker`` only of three frames or more.
+    One number for each of :data:`LIMITS`, by name; ``flicker`` only of three frames or more.
     """
     info = tof.info
     amplitude = np.abs(mean_phasors(tof.raw, info.modulation_hz, info.phase_rad)).min(axis=0)
@@ -191,25 +122,23 @@ def measure(
     return {name: round(value, 7) for name, value in found.items()}
 
 
-def judge(numbers: dict[str, float]) -> list[Check]:
-    """Say which checks fail, the gravest first."""
-    failed = [c for c in CHECKS if c.name in numbers and c.fails(numbers[c.name])]
-    return sorted(failed, key=lambda c: (REFUSE, RETAKE, NOTE).index(c.action))
+def broken_limits(numbers: dict[str, float]) -> list[Limit]:
+    """List the limits that numbers break, the gravest first."""
+    broken = [limit for limit in LIMITS if limit.name in numbers and limit.broken_by(numbers[limit.name])]
+    return sorted(broken, key=lambda limit: (REFUSE, RETAKE, NOTE).index(limit.action))
 
 
-def sentence(check: Check, numbers: dict[str, float]) -> str:
-    """What a failed check has to say."""
-    return check.words.format(numbers[check.name])
-
-
-def record_of(numbers: dict[str, float], failed: list[Check]) -> dict[str, Any]:
-    """What goes into the view's file: the numbers, and a sentence and the action of each check that failed."""
-    notes = [{"check": c.name, "action": c.action, "words": sentence(c, numbers)} for c in failed]
+def quality_table(numbers: dict[str, float]) -> dict[str, Any]:
+    """Write numbers for the view's file, with a sentence and the action of each broken limit."""
+    notes = [
+        {"check": limit.name, "action": limit.action, "words": limit.sentence(numbers)}
+        for limit in broken_limits(numbers)
+    ]
     return {**numbers, "notes": notes}
 
 
 def moved(a: Float64, b: Float64) -> tuple[float, float]:
-    """Metres and radians between two poses (4, 4)."""
+    """Tell how far apart two poses (4, 4) are, in metres and radians."""
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), rotation_angle(invert(a) @ b)
 
 

@@ -1,7 +1,7 @@
 """Make a recording's journal and its files agree, at the start of every run.
 
-A sealed file without a row is verified and adopted, a row without a file is planned again, leftovers of a killed writer go, and
-a damaged file is set aside under another name so that its view can be taken again.
+A sealed file without a row is verified and adopted. A row without a file is planned again. Leftovers of a killed writer go.
+A damaged file is set aside under another name, so that its view can be taken again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 from tofcapture.errors import DataError
 from tofcapture.files.seal import sealed_digest
 from tofcapture.files.view import read_view, view_path
-from tofcapture.record.journal import Journal, Row
+from tofcapture.record.journal import Journal
 
 
 def reconcile(journal: Journal, recording: Path, scene: str) -> list[str]:
@@ -29,49 +29,31 @@ def reconcile(journal: Journal, recording: Path, scene: str) -> list[str]:
     -------
     One sentence for each thing that was put right.
     """
-    folder = view_path(recording, scene, 0).parent
-    known = {row.index for row in journal.rows(scene) if row.state == "sealed"}
-    begun = [row for row in journal.rows(scene) if row.step]
-    return [
-        *_sweep(folder),
-        *_adopt(journal, folder, known),
-        *_miss(journal, recording, scene, known),
-        *_roll_back(journal, begun),
-    ]
-
-
-def _roll_back(journal: Journal, begun: list[Row]) -> list[str]:
-    """Plan views again in whose midst the last run ended, unless their files turned out to be whole."""
-    sealed = {(row.scene, row.index) for row in journal.rows() if row.state == "sealed"}
+    folder, rows = view_path(recording, scene, 0).parent, journal.rows(scene)
+    known = {row.index for row in rows if row.state == "sealed"}
     done = []
-    for row in begun:
-        if (row.scene, row.index) not in sealed:
-            journal.step(row.scene, row.index, "")
+    for path in sorted(folder.glob("*.partial")):
+        path.unlink()
+        done.append(f"{path}: removed, it was never finished")
+    for path in sorted(folder.glob("view-*.h5")):
+        number = path.stem.removeprefix("view-")
+        if number.isdigit() and int(number) not in known:
+            done.append(_adopt(journal, path, scene, int(number)))
+    for index in sorted(i for i in known if not view_path(recording, scene, i).exists()):
+        journal.forget(scene, index, "the file was gone")
+        done.append(f"view {index} of {scene!r}: its file is gone, it will be taken again")
+    sealed = {row.index for row in journal.rows(scene) if row.state == "sealed"}
+    for row in rows:
+        if row.step and row.index not in sealed:
+            journal.step(scene, row.index, "")
             done.append(
-                f"view {row.index} of {row.scene!r}: the last run ended at {row.step!r}, it is taken again"
+                f"view {row.index} of {scene!r}: the last run ended at {row.step!r}, it is taken again"
             )
     return done
 
 
-def _sweep(folder: Path) -> list[str]:
-    """Remove what killed writers left."""
-    stray = sorted(folder.glob("*.partial"))
-    for path in stray:
-        path.unlink()
-    return [f"{path}: removed, it was never finished" for path in stray]
-
-
-def _adopt(journal: Journal, folder: Path, known: set[int]) -> list[str]:
-    """Take whole files that the journal does not know; set damaged ones aside."""
-    done = []
-    for path in sorted(folder.glob("view-*.h5")):
-        number = path.stem.removeprefix("view-")
-        if number.isdigit() and int(number) not in known:
-            done.append(_adopt_one(journal, path, folder.name, int(number)))
-    return done
-
-
-def _adopt_one(journal: Journal, path: Path, scene: str, index: int) -> str:
+def _adopt(journal: Journal, path: Path, scene: str, index: int) -> str:
+    """Take a whole file that the journal does not know, or set it aside; say which."""
     try:
         sha256 = sealed_digest(path)
         view = read_view(path)
@@ -92,11 +74,3 @@ def _set_aside(path: Path) -> Path:
         aside = path.with_name(f"{path.name}.damaged-{number}")
     path.rename(aside)
     return aside
-
-
-def _miss(journal: Journal, recording: Path, scene: str, known: set[int]) -> list[str]:
-    """Plan sealed views again whose file is gone."""
-    gone = sorted(i for i in known if not view_path(recording, scene, i).exists())
-    for index in gone:
-        journal.forget(scene, index, "the file was gone")
-    return [f"view {index} of {scene!r}: its file is gone, it will be taken again" for index in gone]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-import sqlite3
+import platform
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -12,26 +11,25 @@ from typing import Any
 
 import numpy as np
 
+from tofcapture import __version__
+from tofcapture.devices.clearance import route, stage_of
+from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.station import Station
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
+from tofcapture.files.seal import write_text
 from tofcapture.files.view import view_path, write_view
-from tofcapture.record.journal import Journal, hold, hold_arm
-from tofcapture.record.plan import Plan, PlannedView
+from tofcapture.frames import ArmState, StereoFrame, TofBurst, View
+from tofcapture.record.journal import Journal, utc_now
+from tofcapture.record.observer import Observer
+from tofcapture.record.plan import Plan, PlannedView, plan_scene
+from tofcapture.record.quality import REFUSE, RETAKE, broken_limits, measure, quality_table
 from tofcapture.record.reconcile import reconcile
-from tofcapture.record.scene_plan import plan_scene
-from tofcapture.record.shot import capture, notes_of, provenance_of, worth_retaking
-from tofcapture.record.watch import DiskFull, Watch, is_full
+from tofcapture.record.resources import check_space, full_disk_named, hold_arm, hold_recording
 
-_VIEW_BYTES = 40e6  # a view of a full-size rig with truth, and room to spare
-_RESERVE_BYTES = 0.5e9
-_ATTEMPTS = 3
-_GIVE_UP = 2  # views in a row that fail before the run ends
+ATTEMPTS = 3  # at one view
+FAILURES_IN_A_ROW = 2  # that end the run: that is no bad pose, that is a broken device
 
 Progress = Callable[[int, int], None]
-
-
-def _silent(done: int, total: int) -> None:
-    del done, total
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class RecordResult:
     plan
         The plan that was followed.
     notes
-        One sentence for each thing about a view, taken now, that is not as it should be (``record.quality``).
+        One sentence for each thing that is not as it should be in a view taken now (``record.quality``).
     """
 
     scene: str
@@ -67,17 +65,17 @@ class RecordResult:
 def record(
     station: Station,
     scene: str,
-    recording: Path,
+    recording: str | Path,
     views: int = 25,
     frames: int = 10,
-    progress: Progress = _silent,
-    watch: Watch | None = None,
+    progress: Progress | None = None,
+    observer: Observer | None = None,
     turns: int = 1,
 ) -> RecordResult:
     """Take every missing view of one scene.
 
-    It can be killed at any moment and run again: views that are sealed stay, the others are taken, and the arrays are those
-    of a run that was never killed (on the simulated station).
+    It can be killed at any moment and run again: views that are sealed stay, the others are taken. On the simulated station
+    the arrays are those of a run that was never killed.
 
     Parameters
     ----------
@@ -91,7 +89,7 @@ def record(
         Views of the scene, ToF frames of each burst.
     progress
         Called with (views there, views planned) before the first and after each view.
-    watch
+    observer
         Looks on; may make the recorder wait between views, or end it.
     turns
         In how many ways the object is put on the table (``record.plan``); the operator is asked to turn it.
@@ -107,60 +105,51 @@ def record(
     DeviceError
         Two views in a row failed three times each.
     Stopped
-        The watch ended the run.
+        The observer ended the run.
     """
     if frames < 1:
         raise ConfigError(f"frames: expected at least 1, got {frames}")
-    watch = watch or Watch()
+    recording, observer = Path(recording), observer or Observer()
     plan = plan_scene(station, scene, views, turns)
-    _check_turns(station, plan)
-    try:
-        _begin(recording, station)
-        with hold(recording), hold_arm(station.arm), closing(Journal(recording)) as journal:
-            journal.agree({"station": station.describe(), "frames": frames, "sim": _world(station)})
-            repaired = reconcile(journal, recording, scene)
-            kept = journal.expect(scene, {view.index: view.digest for view in plan.views})
-            watch.planned(plan, kept, repaired)
-            missing = [view for view in plan.views if view.index not in kept]
-            taking = _Taking(station, scene, recording, frames, plan, journal, watch)
-            reasons = _take_all(taking, missing, len(kept), progress)
-            notes = [f"view {i}: {note}" for i in sorted(taking.notes) for note in taking.notes[i]]
-    except (OSError, RuntimeError, sqlite3.OperationalError) as err:
-        if not is_full(err):
-            raise
-        raise DiskFull(
-            f"{recording}: the disk takes no more: {str(err).partition('(')[0].strip()}",
-            hint="free some space, then run the same again",
-        ) from err
-    return RecordResult(
-        scene=scene,
-        recorded=tuple(sorted({view.index for view in missing} - reasons.keys())),
-        kept=tuple(sorted(kept)),
-        failed=tuple(sorted(reasons)),
-        reasons=tuple(f"view {i}: {reasons[i]}" for i in sorted(reasons)),
-        repaired=tuple(repaired),
-        plan=plan,
-        notes=tuple(notes),
-    )
-
-
-def _world(station: Station) -> dict[str, Any]:
-    """What a simulated world is made of; faults on demand come and go without making it another."""
-    return {key: value for key, value in station.config.get("sim", {}).items() if key != "faults"}
-
-
-def _check_turns(station: Station, plan: Plan) -> None:
-    """Refuse a plan with turns of the object where nobody can turn it."""
     if any(view.turn for view in plan.views) and not station.operator.can_turn:
         raise ConfigError(
             "turns: this station's operator cannot turn the object",
             hint='a person can: [operator] driver = "console", in a terminal; or record without --turns',
         )
+    with full_disk_named(recording):
+        recording.mkdir(parents=True, exist_ok=True)
+        _keep_configuration(recording, station)
+        with hold_recording(recording), hold_arm(station.arm), closing(Journal(recording)) as journal:
+            journal.agree({"station": station.describe(), "frames": frames, "world": station.world})
+            repaired = reconcile(journal, recording, scene)
+            kept = journal.expect(scene, {view.index: view.digest for view in plan.views})
+            observer.planned(plan, kept, repaired)
+            run = _Run(station, scene, recording, frames, plan, journal, observer)
+            missing = [view for view in plan.views if view.index not in kept]
+            for n, planned in enumerate(missing):
+                if progress:
+                    progress(len(kept) + n - len(run.reasons), len(plan.views))
+                observer.before_view(planned.index)
+                check_space(recording, len(missing) - n)
+                run.place_object(planned)
+                run.take(planned)
+            if progress:
+                progress(len(plan.views) - len(run.reasons), len(plan.views))
+    return run.result(kept, repaired)
 
 
-@dataclass(frozen=True)
-class _Taking:
-    """What stays the same from view to view."""
+def _keep_configuration(recording: Path, station: Station) -> None:
+    """Keep a copy of the station's configuration in the recording."""
+    import tomli_w
+
+    copy = recording / "station.toml"
+    if not copy.exists():
+        write_text(copy, tomli_w.dumps(station.config))
+
+
+@dataclass
+class _Run:
+    """One run over the views of a scene: what stays the same from view to view, and what came of them."""
 
     station: Station
     scene: str
@@ -168,97 +157,132 @@ class _Taking:
     frames: int
     plan: Plan
     journal: Journal
-    watch: Watch
+    observer: Observer
+    turned: float | None = None  # how the object stands; after an earlier run nobody knows
+    failed_in_a_row: int = 0
+    recorded: list[int] = field(default_factory=list)
+    reasons: dict[int, str] = field(default_factory=dict)
     notes: dict[int, list[str]] = field(default_factory=dict)
+
+    def place_object(self, planned: PlannedView) -> None:
+        """Have the object put on the table, and turned where the plan turns it."""
+        if self.turned is None:
+            self.station.operator.place(self.scene)
+        if planned.turn != self.turned and any(view.turn for view in self.plan.views):
+            self.station.operator.turn(self.scene, planned.turn)
+        self.turned = planned.turn
+
+    def take(self, planned: PlannedView) -> None:
+        """Take and seal one view, or give it up.
+
+        Raises
+        ------
+        DeviceError
+            This view and the one before it failed.
+        """
+        try:
+            self.seal(self.expose_until_good(planned))
+        except DeviceError as err:
+            # An arm that was told to stop refuses to move: the observer says so, that is no failure of the view.
+            self.observer.step(planned.index, "failed")
+            self.journal.fail(self.scene, planned.index, err.message)
+            self.observer.failed(planned.index, err.message)
+            self.reasons[planned.index] = err.message
+            self.failed_in_a_row += 1
+            if self.failed_in_a_row >= FAILURES_IN_A_ROW:
+                raise
+        else:
+            self.recorded.append(planned.index)
+            self.failed_in_a_row = 0
+
+    def expose_until_good(self, planned: PlannedView) -> View:
+        """Move, expose and check, three times at most; a refused motion is refused for good."""
+        for attempt in range(1, ATTEMPTS + 1):
+            self.journal.attempt(self.scene, planned.index)
+            try:
+                before = self.move(planned)
+                tof, stereo, after = self.expose(planned)
+                numbers = self.check(tof, stereo, before, after)
+            except MotionRefused:
+                raise
+            except DeviceError:
+                if attempt == ATTEMPTS:
+                    raise
+                continue
+            broken = broken_limits(numbers)
+            if attempt == ATTEMPTS or not any(limit.action == RETAKE for limit in broken):
+                break
+        if broken:
+            self.notes[planned.index] = [limit.sentence(numbers) for limit in broken]
+        provenance = {**self.provenance(planned), "quality": quality_table(numbers)}
+        truth, rig = self.station.operator.truth(), self.station.rig
+        return View(self.scene, planned.index, tof, stereo, before, after, rig, provenance, truth)
+
+    def move(self, planned: PlannedView) -> ArmState:
+        """Move by a clear way; the arm returns settled."""
+        self.begin(planned.index, "moving")
+        model, stage = arm_model(self.station.arm.describe().model), stage_of(self.station.config)
+        state = self.station.arm.state()
+        for joints in route(model, self.station.rig, stage, state.joints, planned.joints):
+            state = self.station.arm.move_to(joints)
+        return state
+
+    def expose(self, planned: PlannedView) -> tuple[TofBurst, StereoFrame, ArmState]:
+        """Expose ToF first and alone: the stereo camera's projector would shine into its pixels."""
+        self.begin(planned.index, "tof")
+        tof = self.station.tof.capture(self.frames)
+        self.begin(planned.index, "stereo")
+        stereo = self.station.stereo.capture()
+        return tof, stereo, self.station.arm.state()
+
+    def check(
+        self, tof: TofBurst, stereo: StereoFrame, before: ArmState, after: ArmState
+    ) -> dict[str, float]:
+        """Measure what came, and refuse what is of no use (``record.quality``)."""
+        numbers = measure(tof, stereo, before, after, self.station.rig, self.frames)
+        for limit in broken_limits(numbers):
+            if limit.action == REFUSE:
+                raise DeviceError(limit.sentence(numbers), hint=limit.hint)
+        return numbers
+
+    def seal(self, view: View) -> None:
+        """Write a view under its name, then note it in the journal."""
+        self.begin(view.index, "sealing")
+        digest = write_view(view_path(self.recording, self.scene, view.index), view)
+        self.journal.seal(self.scene, view.index, digest)
+        self.observer.sealed(view, digest)
 
     def begin(self, index: int, step: str) -> None:
         """Journal a step of a view, before anything is done."""
         self.journal.step(self.scene, index, step)
-        self.watch.step(index, step)
+        self.observer.step(index, step)
 
+    def provenance(self, planned: PlannedView) -> dict[str, Any]:
+        """Say how a view came about."""
+        return {
+            "tofcapture": __version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "arm": self.station.describe()["arm"],
+            "seed": self.station.seed,
+            "simulated": self.station.simulated,
+            "plan": self.plan.digest,
+            "pose": planned.digest,
+            "distance": planned.distance,
+            "direction": planned.direction.tolist(),
+            "turn_deg": planned.as_json()["turn_deg"],
+            "utc": utc_now(),
+        }
 
-def _take_all(taking: _Taking, missing: list[PlannedView], kept: int, progress: Progress) -> dict[int, str]:
-    """Take views in turn; return the reason of each that was given up, by number."""
-    _check_space(taking.recording, len(missing))
-    if missing:
-        taking.station.operator.place(taking.scene)
-    # How the object stands after an earlier run, nobody knows: where it is turned at all, the first view asks too.
-    total, turned = len(taking.plan.views), np.nan if any(v.turn for v in taking.plan.views) else 0.0
-    reasons: dict[int, str] = {}
-    for turn, planned in enumerate(missing):
-        progress(kept + turn - len(reasons), total)
-        taking.watch.before_view(planned.index)
-        _check_space(taking.recording, 1)
-        if planned.turn != turned:
-            taking.station.operator.turn(taking.scene, planned.turn)
-            turned = planned.turn
-        try:
-            _take(taking, planned)
-        except DeviceError as err:
-            # An arm that was told to stop refuses to move: that is no failure of the view.
-            taking.watch.step(planned.index, "failed")
-            taking.journal.fail(taking.scene, planned.index, err.message)
-            taking.watch.failed(planned.index, err.message)
-            reasons[planned.index] = err.message
-            if _hopeless(missing[: turn + 1], reasons):
-                raise
-    progress(total - len(reasons), total)
-    return reasons
-
-
-def _hopeless(tried: list[PlannedView], reasons: dict[int, str]) -> bool:
-    """Tell whether the last views tried failed one after the other: that is no bad pose, that is a broken device."""
-    return len(tried) >= _GIVE_UP and all(view.index in reasons for view in tried[-_GIVE_UP:])
-
-
-def _begin(recording: Path, station: Station) -> None:
-    """Make the folder and keep a copy of the station's configuration in it."""
-    import tomli_w
-
-    from tofcapture.files.seal import write_text
-
-    recording.mkdir(parents=True, exist_ok=True)
-    copy = recording / "station.toml"
-    if not copy.exists():
-        write_text(copy, tomli_w.dumps(station.config))
-
-
-def _check_space(recording: Path, missing: int) -> None:
-    """Refuse to begin what the disk cannot hold."""
-    free = shutil.disk_usage(recording).free
-    needed = missing * _VIEW_BYTES + _RESERVE_BYTES
-    if missing and free < needed:
-        raise DiskFull(
-            f"{recording}: expected {needed / 1e9:.1f} GB of free disk, got {free / 1e9:.1f} GB",
-            hint="free some space, or ask for fewer views",
+    def result(self, kept: set[int], repaired: list[str]) -> RecordResult:
+        """Sum up."""
+        return RecordResult(
+            scene=self.scene,
+            recorded=tuple(sorted(self.recorded)),
+            kept=tuple(sorted(kept)),
+            failed=tuple(sorted(self.reasons)),
+            reasons=tuple(f"view {i}: {self.reasons[i]}" for i in sorted(self.reasons)),
+            repaired=tuple(repaired),
+            plan=self.plan,
+            notes=tuple(f"view {i}: {note}" for i in sorted(self.notes) for note in self.notes[i]),
         )
-
-
-def _take(taking: _Taking, planned: PlannedView) -> None:
-    """Take and seal one view, three attempts at most; a refused motion is refused for good."""
-    provenance = provenance_of(taking.station, taking.plan, planned)
-    for attempt in range(1, _ATTEMPTS + 1):
-        taking.journal.attempt(taking.scene, planned.index)
-        try:
-            view = capture(
-                taking.station,
-                taking.scene,
-                planned,
-                taking.frames,
-                provenance,
-                lambda step: taking.begin(planned.index, step),
-            )
-        except MotionRefused:
-            raise
-        except DeviceError:
-            if attempt == _ATTEMPTS:
-                raise
-        else:
-            if attempt == _ATTEMPTS or not worth_retaking(view):
-                break
-    if notes := notes_of(view):
-        taking.notes[planned.index] = notes
-    taking.begin(planned.index, "sealing")
-    digest = write_view(view_path(taking.recording, taking.scene, planned.index), view)
-    taking.journal.seal(taking.scene, planned.index, digest)
-    taking.watch.sealed(view, digest)

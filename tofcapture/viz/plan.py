@@ -11,7 +11,8 @@ import numpy as np
 from tofcapture.devices.clearance import Stage
 from tofcapture.files.seal import write_text
 from tofcapture.poses import Float64, transform_points
-from tofcapture.record.plan import REMEDIES, Plan, PlannedView
+from tofcapture.record.candidates import REMEDIES
+from tofcapture.record.plan import Plan, PlannedView
 from tofcapture.rig import Rig
 from tofcapture.viz.charts import LINES, canvas, frustum, svg_text
 
@@ -102,10 +103,10 @@ def _draw_refused(axes: Any, plan: Plan, shown: list[int]) -> None:
     """Draw a dot in the colour of its reason for each refused candidate, thinned out evenly."""
     if plan.tried is None:
         return
-    lost = np.flatnonzero(plan.tried.fates >= 0)
+    lost = np.flatnonzero(plan.tried.refusal >= 0)
     lost = lost[:: max(1, -(-len(lost) // _DOTS))]
     for number, colour in enumerate(_REASONS):
-        spots = plan.tried.spots[lost[plan.tried.fates[lost] == number]]
+        spots = plan.tried.spots[lost[plan.tried.refusal[lost] == number]]
         axes.plot(*spots[:, shown].T, "o", color=colour, ms=2.5, mew=0, alpha=0.45)
 
 

@@ -17,8 +17,8 @@ from torch.utils.data import Dataset
 
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
-from tofcapture.files.cache import PackedScene
 from tofcapture.files.layout import MaskBit
+from tofcapture.files.packed import PackedScene
 from tofcapture.files.shard import ShardReader
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoder, TapNoise, frequencies, photon_transfer

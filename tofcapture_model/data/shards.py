@@ -15,8 +15,9 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from tofcapture.errors import DataError
-from tofcapture.files.cache import PackedScene, open_cache
+from tofcapture.files.cache import open_cache
 from tofcapture.files.manifest import load_manifest
+from tofcapture.files.packed import PackedScene
 from tofcapture.files.shard import ShardReader
 
 

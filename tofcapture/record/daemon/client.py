@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture.errors import BusyError, DataError, DeviceError, TofError, UsageError
-from tofcapture.record.daemon.state import StateFolder, default_folder
+from tofcapture.record.daemon.settings import state_folder
 
 _TIMEOUT = 5.0  # s
-_KINDS = {404: DataError, 409: BusyError, 422: UsageError}
+_ERRORS = {404: DataError, 409: BusyError, 422: UsageError}
 
 
 class _UnixConnection(http.client.HTTPConnection):
@@ -25,37 +25,6 @@ class _UnixConnection(http.client.HTTPConnection):
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self.sock.settimeout(_TIMEOUT)
         self.sock.connect(str(self._path))
-
-
-def hand_over(recording: Path, wish: Mapping[str, Any], state: Path | None = None) -> dict[str, Any] | None:
-    """Queue a scene with the daemon that keeps a recording, if there is one.
-
-    Parameters
-    ----------
-    recording
-        Folder to record into.
-    wish
-        ``scene``, ``views``, ``frames``, and ``seed`` when it is given.
-    state
-        The daemon's folder; the default one for ``None``.
-
-    Returns
-    -------
-    The job; ``None`` when no daemon runs, or its recordings lie elsewhere.
-
-    Raises
-    ------
-    UsageError, BusyError
-        The daemon refuses.
-    """
-    try:
-        root = Path(ask("GET", "/v1/state", state=state)["root"])
-    except DeviceError:
-        return None
-    where = recording.resolve()
-    if where.parent != root:
-        return None
-    return ask("POST", "/v1/jobs", {**wish, "recording": where.name}, state)
 
 
 def ask(
@@ -77,7 +46,7 @@ def ask(
     UsageError, BusyError, DataError, TofError
         It refuses, in its words.
     """
-    folder = StateFolder((state or default_folder()).absolute())
+    folder = state_folder(state)
     link = _UnixConnection(folder.socket)
     headers = {"X-Tofcapture": "1", "Content-Type": "application/json"}
     try:
@@ -93,5 +62,36 @@ def ask(
         link.close()
     if answer.status >= 400:
         error = found["error"]
-        raise _KINDS.get(answer.status, TofError)(error["message"], error["hint"])
+        raise _ERRORS.get(answer.status, TofError)(error["message"], error["hint"])
     return found
+
+
+def hand_over(recording: Path, job: Mapping[str, Any], state: Path | None = None) -> dict[str, Any] | None:
+    """Queue a scene with the daemon that keeps a recording.
+
+    Parameters
+    ----------
+    recording
+        Folder to record into.
+    job
+        ``scene``, ``views``, ``frames``, and ``seed`` when it is given.
+    state
+        The daemon's folder; the default one for ``None``.
+
+    Returns
+    -------
+    The job; ``None`` when no daemon runs, or its recordings lie elsewhere.
+
+    Raises
+    ------
+    UsageError, BusyError
+        The daemon refuses.
+    """
+    try:
+        root = Path(ask("GET", "/v1/state", state=state)["root"])
+    except DeviceError:
+        return None
+    where = recording.resolve()
+    if where.parent != root:
+        return None
+    return ask("POST", "/v1/jobs", {**job, "recording": where.name}, state)

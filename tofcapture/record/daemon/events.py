@@ -6,7 +6,7 @@ import asyncio
 
 from aiohttp import web
 
-from tofcapture.record.daemon.guard import HEADERS, Connections, refusal
+from tofcapture.record.daemon.guard import HEADERS, refusal
 from tofcapture.record.daemon.store import Event, Store
 
 MOST_STREAMS = 512
@@ -14,13 +14,15 @@ _BACKLOG = 256  # events that a client may be behind
 _QUIET = 15.0  # s without an event until a comment shows that the line stands
 _WRITE = 20.0  # s that a client may take to read
 
+_Queue = asyncio.Queue[tuple[int, bytes] | None]  # (id, text) of events; None ends the stream
+
 
 class Streams:
     """All open event streams."""
 
-    def __init__(self, store: Store, connections: Connections) -> None:
-        self._store, self._connections = store, connections
-        self._queues: set[asyncio.Queue[tuple[int, bytes] | None]] = set()
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._queues: set[_Queue] = set()
         self._closed = False
 
     def __len__(self) -> int:
@@ -47,7 +49,7 @@ class Streams:
             return refusal(503, "streams", f"expected at most {MOST_STREAMS} event streams")
         after = _after(request)
         response = web.StreamResponse(headers={**HEADERS, "Content-Type": "text/event-stream"})
-        queue: asyncio.Queue[tuple[int, bytes] | None] = asyncio.Queue()
+        queue: _Queue = asyncio.Queue()
         self._queues.add(queue)
         try:
             await response.prepare(request)
@@ -58,9 +60,7 @@ class Streams:
             self._queues.discard(queue)
         return response
 
-    async def _feed(
-        self, response: web.StreamResponse, queue: asyncio.Queue[tuple[int, bytes] | None], after: int | None
-    ) -> None:
+    async def _feed(self, response: web.StreamResponse, queue: _Queue, after: int | None) -> None:
         last = self._store.last_event() if after is None else after
         await _write(response, b"retry: 1000\n: hello\n\n")
         for event in self._store.events(last) if after is not None else ():
@@ -71,8 +71,8 @@ class Streams:
                 await _write(response, text)
 
 
-async def _next(queue: asyncio.Queue[tuple[int, bytes] | None]) -> list[tuple[int, bytes]] | None:
-    """All events that wait, in one piece; a comment when there are none for a while, ``None`` when the stream ends."""
+async def _next(queue: _Queue) -> list[tuple[int, bytes]] | None:
+    """Take all events that wait; a comment when there are none for a while, ``None`` when the stream ends."""
     items: list[tuple[int, bytes] | None] = []
     try:
         async with asyncio.timeout(_QUIET):
@@ -84,7 +84,7 @@ async def _next(queue: asyncio.Queue[tuple[int, bytes] | None]) -> list[tuple[in
     return None if None in items else [item for item in items if item is not None]
 
 
-def _end(queue: asyncio.Queue[tuple[int, bytes] | None]) -> None:
+def _end(queue: _Queue) -> None:
     while not queue.empty():
         queue.get_nowait()
     queue.put_nowait(None)
@@ -96,7 +96,7 @@ async def _write(response: web.StreamResponse, text: bytes) -> None:
 
 
 def _after(request: web.Request) -> int | None:
-    """Where a client left off; ``None`` when it wants only what is new."""
+    """Read where a client left off; ``None`` when it wants only what is new."""
     given = request.query.get("after", request.headers.get("Last-Event-ID"))
     if given is None:
         return None

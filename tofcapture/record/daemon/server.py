@@ -3,31 +3,35 @@
 from __future__ import annotations
 
 import asyncio
+import getpass
 import ipaddress
 import logging
+import os
 import signal
 import socket
+import sys
 from collections.abc import Callable
 from contextlib import closing
-from functools import partial
+from pathlib import Path
 
 from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from tofcapture.errors import BusyError, ConfigError, UsageError
-from tofcapture.record.daemon import systemd
-from tofcapture.record.daemon.api import PAGE_FILES, Api
+from tofcapture.record.daemon.app import PAGE_FILES, Api
 from tofcapture.record.daemon.events import Streams
-from tofcapture.record.daemon.guard import Connections, Guard, Watched
-from tofcapture.record.daemon.settings import Settings
-from tofcapture.record.daemon.state import StateFolder, only_one, token_of
+from tofcapture.record.daemon.guard import Guard
+from tofcapture.record.daemon.settings import Settings, StateFolder, only_one, token_of
 from tofcapture.record.daemon.store import Store
 from tofcapture.record.daemon.supervisor import Supervisor
 
 _BACKLOG = 512
+_UNIT = Path(__file__).with_name("tofcapture.service")
+
+Address = tuple[str, int]
 
 
-def tcp_address(text: str) -> tuple[str, int]:
+def tcp_address(text: str) -> Address:
     """Read ``127.0.0.1:8765``.
 
     Raises
@@ -49,7 +53,7 @@ def tcp_address(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def serve(settings: Settings, http: tuple[str, int] | None, announce: Callable[[str | None], None]) -> None:
+def serve(settings: Settings, http: Address | None, announce: Callable[[str | None], None]) -> None:
     """Run until SIGTERM or SIGINT.
 
     Parameters
@@ -73,12 +77,11 @@ def serve(settings: Settings, http: tuple[str, int] | None, announce: Callable[[
 
 
 async def _serve(
-    settings: Settings, store: Store, http: tuple[str, int] | None, announce: Callable[[str | None], None]
+    settings: Settings, store: Store, http: Address | None, announce: Callable[[str | None], None]
 ) -> None:
-    token, connections = token_of(settings.state), Connections()
-    streams = Streams(store, connections)
+    token, streams = token_of(settings.state), Streams(store)
+    guard = Guard(token, frozenset(PAGE_FILES))
     supervisor = Supervisor(settings, store, streams.publish)
-    guard = Guard(token, frozenset(PAGE_FILES), connections)
     api = Api(supervisor, streams, guard)
     runner = web.AppRunner(
         api.application(),
@@ -90,49 +93,51 @@ async def _serve(
     logging.getLogger("aiohttp.server").addFilter(_is_our_fault)
     await runner.setup()
     end = asyncio.Event()
-    loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, end.set)
-    listening = await _listen(runner, settings.state, http, guard, connections)
+        asyncio.get_running_loop().add_signal_handler(number, end.set)
+    await _listen(runner, settings.state, http)
+    api.page_url = _page_url(runner, token, guard)
     work = asyncio.create_task(supervisor.run())
     work.add_done_callback(lambda _: end.set())
-    life = asyncio.create_task(_show_life(supervisor))
-    api.page_url = _url(listening, token)
+    helpers = [asyncio.create_task(_show_life(supervisor))]
+    if runner.server is not None:
+        helpers.append(asyncio.create_task(guard.hang_up(runner.server)))
     announce(api.page_url)
-    systemd.notify("READY=1")
+    notify("READY=1")
     await end.wait()
-    systemd.notify("STOPPING=1")
-    life.cancel()
-    for server in listening:
-        server.close()
+    notify("STOPPING=1")
+    for site in list(runner.sites):
+        await site.stop()
+    for helper in helpers:
+        helper.cancel()
     await supervisor.close()
     streams.close()
     await runner.cleanup()
     await work
 
 
-async def _listen(
-    runner: web.AppRunner,
-    state: StateFolder,
-    http: tuple[str, int] | None,
-    guard: Guard,
-    connections: Connections,
-) -> list[asyncio.Server]:
+async def _listen(runner: web.AppRunner, state: StateFolder, http: Address | None) -> None:
     """Listen on the Unix socket, and on TCP when wanted."""
-    loop = asyncio.get_running_loop()
-    make = partial(_connection, runner, connections)
-    servers = [await loop.create_unix_server(make, path=str(state.socket), backlog=_BACKLOG)]
+    await web.UnixSite(runner, str(state.socket), backlog=_BACKLOG).start()
     state.socket.chmod(0o600)
     if http is not None:
         try:
-            tcp = await loop.create_server(make, *http, backlog=_BACKLOG)
+            await web.TCPSite(runner, *http, backlog=_BACKLOG).start()
         except OSError as err:
             raise BusyError(
                 f"cannot listen on {http[0]}:{http[1]}: {err.strerror}", hint="take another port"
             ) from err
-        guard.serve_tcp(tcp.sockets[0].getsockname()[1])
-        servers.append(tcp)
-    return servers
+
+
+def _page_url(runner: web.AppRunner, token: str, guard: Guard) -> str | None:
+    """Find the address of the page, if TCP is served at all; the guard hears the port."""
+    for address in runner.addresses:
+        if not isinstance(address, str):
+            host, port = address[:2]
+            guard.serve_tcp(port)
+            name = f"[{host}]" if ":" in host else host
+            return f"http://{name}:{port}/#token={token}"
+    return None
 
 
 def _is_our_fault(record: logging.LogRecord) -> bool:
@@ -140,27 +145,39 @@ def _is_our_fault(record: logging.LogRecord) -> bool:
     return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))
 
 
-def _connection(runner: web.AppRunner, connections: Connections) -> Watched:
-    server = runner.server
-    if server is None:
-        raise AssertionError
-    return Watched(server(), connections)
-
-
-def _url(listening: list[asyncio.Server], token: str) -> str | None:
-    for server in listening:
-        for link in server.sockets:
-            if link.family != socket.AF_UNIX:
-                host, port = link.getsockname()[:2]
-                name = f"[{host}]" if ":" in host else host
-                return f"http://{name}:{port}/#token={token}"
-    return None
-
-
 async def _show_life(supervisor: Supervisor) -> None:
     """Tell systemd that the loop turns; a recorder that hangs is the supervisor's business."""
-    period = systemd.watchdog_period()
+    period = watchdog_period()
     while True:
         counts = supervisor.progress.counts()
-        systemd.notify(f"STATUS={supervisor.phase}, view {counts['sealed']}/{counts['total']}", "WATCHDOG=1")
+        notify(f"STATUS={supervisor.phase}, view {counts['sealed']}/{counts['total']}", "WATCHDOG=1")
         await asyncio.sleep(min(period or 5.0, 5.0))
+
+
+def notify(*lines: str) -> bool:
+    """Send lines (``READY=1`` ...) to systemd; false when it did not start us, or does not listen."""
+    where = os.environ.get("NOTIFY_SOCKET")
+    if not where:
+        return False
+    address = "\0" + where[1:] if where.startswith("@") else where
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as link:
+            link.connect(address)
+            link.send("\n".join(lines).encode())
+    except OSError:
+        return False
+    return True
+
+
+def watchdog_period() -> float | None:
+    """Find the seconds between signs of life that systemd wants (half its limit); ``None`` when it wants none."""
+    limit = os.environ.get("WATCHDOG_USEC", "")
+    meant = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+    return int(limit) / 2e6 if limit.isdigit() and int(limit) and meant else None
+
+
+def unit(root: Path, state: Path) -> str:
+    """Write the systemd unit; it never allows motion of a real arm, that is given anew by a person."""
+    program = f"{sys.executable} -m tofcapture"
+    text = _UNIT.read_text(encoding="utf-8")
+    return text.format(program=program, root=root.resolve(), state=state.resolve(), user=getpass.getuser())

@@ -1,13 +1,51 @@
-"""What the daemon was started with."""
+"""What the daemon is started with, and its own folder: queue, token, socket, lock, previews."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import secrets
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tofcapture.record.daemon.child import WORKER
-from tofcapture.record.daemon.state import StateFolder
+from tofcapture.errors import ConfigError
+from tofcapture.record.resources import hold_file
+
+_SOCKET_LIMIT = 107  # bytes of a Unix socket's path that Linux takes
+
+
+@dataclass(frozen=True)
+class StateFolder:
+    """Paths in the daemon's folder, all of them for its user alone."""
+
+    root: Path
+
+    @property
+    def socket(self) -> Path:
+        """Where the API listens."""
+        return self.root / "daemon.sock"
+
+    @property
+    def database(self) -> Path:
+        """Queue and events."""
+        return self.root / "queue.sqlite"
+
+    @property
+    def previews(self) -> Path:
+        """Latest pictures."""
+        return self.root / "preview"
+
+    @property
+    def token(self) -> Path:
+        """The secret that a TCP client must show."""
+        return self.root / "token"
+
+    @property
+    def socket_fits(self) -> bool:
+        """Whether the socket's path is short enough for one."""
+        return len(os.fsencode(self.socket)) <= _SOCKET_LIMIT
 
 
 @dataclass(frozen=True)
@@ -26,10 +64,78 @@ class Settings:
         A real arm may move.
     worker
         Command of the recorder's process.
+    silence_limit
+        Seconds without a sign of life after which a recorder is killed.
     """
 
     root: Path
     state: StateFolder
     station: Path | None = None
     allow_motion: bool = False
-    worker: Sequence[str] = WORKER
+    worker: Sequence[str] = (sys.executable, "-m", "tofcapture.record.daemon.worker")
+    silence_limit: float = 20.0
+
+
+def state_folder(root: Path | None) -> StateFolder:
+    """Find the daemon's folder: ``root``, ``$TOFCAPTURE_STATE``, systemd's, or ``~/.local/state/tofcapture``."""
+    named = root or os.environ.get("TOFCAPTURE_STATE") or os.environ.get("STATE_DIRECTORY")
+    base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return StateFolder(Path(named or Path(base) / "tofcapture").absolute())
+
+
+def open_folder(root: Path | None) -> StateFolder:
+    """Make the folder, or make sure that it is this user's and nobody else can look into it.
+
+    Raises
+    ------
+    ConfigError
+        It belongs to another user, or its path is too long for a socket.
+    """
+    state = state_folder(root)
+    if not state.socket_fits:
+        raise ConfigError(
+            f"{state.socket}: expected at most {_SOCKET_LIMIT} bytes, a socket's path holds no more",
+            hint="give a shorter --state",
+        )
+    state.root.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if state.root.stat().st_uid != os.getuid():
+        raise ConfigError(
+            f"{state.root}: belongs to another user", hint="give a folder of your own with --state"
+        )
+    state.root.chmod(0o700)
+    state.previews.mkdir(mode=0o700, exist_ok=True)
+    return state
+
+
+def token_of(state: StateFolder) -> str:
+    """Read the token; make one when there is none. The file is readable by its user alone."""
+    try:
+        handle = os.open(state.token, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+    except FileExistsError:
+        state.token.chmod(0o600)
+    else:
+        with os.fdopen(handle, "w", encoding="ascii") as file:
+            file.write(secrets.token_urlsafe(32))
+            file.flush()
+            os.fsync(handle)
+    token = state.token.read_text(encoding="ascii").strip()
+    if len(token) < 32:
+        raise ConfigError(f"{state.token}: expected a token of 32 characters or more", hint="delete the file")
+    return token
+
+
+@contextmanager
+def only_one(state: StateFolder) -> Iterator[None]:
+    """Hold the folder: one daemon per folder. A socket that a dead one left is removed.
+
+    Raises
+    ------
+    BusyError
+        A daemon is running.
+    """
+    with hold_file(state.root / "lock", f"{state.root}: a daemon is running", "tofcapture status"):
+        state.socket.unlink(missing_ok=True)
+        try:
+            yield
+        finally:
+            state.socket.unlink(missing_ok=True)

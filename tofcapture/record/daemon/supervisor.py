@@ -3,26 +3,156 @@
 from __future__ import annotations
 
 import asyncio
-import sqlite3
+import contextlib
+import json
+import os
+import shutil
 import sys
-from collections.abc import Callable, Mapping
-from typing import Any
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import asdict
+from typing import Any, Self
 
+from tofcapture import __version__
 from tofcapture.files.view import check_scene_name
-from tofcapture.record.daemon.child import Child, start
-from tofcapture.record.daemon.progress import Progress
 from tofcapture.record.daemon.settings import Settings
-from tofcapture.record.daemon.snapshot import health, snapshot
 from tofcapture.record.daemon.store import Event, Job, Store
 from tofcapture.record.journal import utc_now
-from tofcapture.record.watch import is_full
+from tofcapture.record.resources import DiskFull
 
 GRACE = 3.0  # s from the order to stop until a recorder is killed
-_LOST = 20.0  # s without a sign of life until it is killed
+_SILENT = 3.0  # s without a sign of life until health says so
 _HEALTH = 2.0  # s between health events
 _BACKOFF = (0.2, 1.0, 3.0)  # s before a crashed recorder of a simulated arm is started again
+_LINE = 4 * 1024 * 1024  # bytes; a plan of thousands of views fits
+_ENDS = {"done", "stopped", "error"}  # kinds of a recorder's last message
 
-_KEPT = {"planned", "step", "sealed", "failed", "ask", "answered", "paused", "resumed", "log", "opened"}
+
+class RecorderProcess:
+    """A started recorder: orders in, messages out, and how long it has been silent."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self._process = process
+        self._heard = time.monotonic()
+
+    @classmethod
+    async def start(cls, job: Mapping[str, Any], settings: Settings) -> Self:
+        """Start a recorder on a job, in a session of its own: Ctrl-C at a terminal reaches the daemon alone."""
+        pipe = asyncio.subprocess.PIPE
+        # Numerical libraries that spin on every core would take them from the daemon.
+        env = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
+        started = cls(
+            await asyncio.create_subprocess_exec(
+                *settings.worker, stdin=pipe, stdout=pipe, start_new_session=True, limit=_LINE, env=env
+            )
+        )
+        started._send(job)
+        return started
+
+    @property
+    def silence(self) -> float:
+        """Seconds since the last message."""
+        return time.monotonic() - self._heard
+
+    def order(self, verb: str) -> None:
+        """Give an order; one that has ended already hears nothing, which is right."""
+        self._send({"do": verb})
+
+    def _send(self, message: Mapping[str, Any]) -> None:
+        pipe = self._process.stdin
+        if pipe is not None and not pipe.is_closing():
+            with contextlib.suppress(OSError):
+                pipe.write(json.dumps(message).encode() + b"\n")
+
+    async def messages(self) -> AsyncIterator[dict[str, Any]]:
+        """Hear what it tells, until it ends; signs of life are counted, not passed on."""
+        assert self._process.stdout is not None
+        async for line in self._process.stdout:
+            self._heard = time.monotonic()
+            try:
+                message = json.loads(line)
+            except ValueError:
+                continue  # the last line of a killed process
+            if message["kind"] != "alive":
+                yield message
+
+    def kill(self) -> None:
+        """End it now; driver hosts notice that their parent is gone and stop what they drive."""
+        with contextlib.suppress(ProcessLookupError):
+            self._process.kill()
+
+    async def end(self) -> None:
+        """Wait until it has ended; it is killed when it takes too long."""
+        try:
+            async with asyncio.timeout(GRACE):
+                await self._process.wait()
+        except TimeoutError:
+            self.kill()
+            await self._process.wait()
+
+
+class Progress:
+    """How far the job in hand is, put together from what its recorder tells."""
+
+    def __init__(self) -> None:
+        self.job: int | None = None
+        self.views: dict[int, dict[str, Any]] = {}
+        self.doing: dict[str, Any] | None = None
+        self.asks: str | None = None
+        self.simulated: bool | None = None
+        self.resting = False
+        self.sealed_now = 0
+        self._since = 0.0
+
+    def begin(self, job: int) -> None:
+        """Forget the job before; a job that goes on after a crash keeps its table until the new plan comes."""
+        if job != self.job:
+            self.views = {}
+        self.end()
+        self.job, self.sealed_now, self.simulated = job, 0, None
+
+    def end(self) -> None:
+        """Do nothing any more."""
+        self.doing, self.asks, self.resting = None, None, False
+
+    def hear(self, message: Mapping[str, Any]) -> None:
+        """Take in one message of the recorder."""
+        kind = message["kind"]
+        if kind == "opened":
+            self.simulated = bool(message["simulated"])
+        elif kind == "planned":
+            # What was measured of a view before the recorder was started anew still holds.
+            self.views = {v["index"]: {**self.views.get(v["index"], {}), **v} for v in message["views"]}
+            self._since = time.monotonic()
+        elif kind == "step" and message["step"] != "failed":
+            self.doing = {"index": message["index"], "step": message["step"]}
+        elif kind in {"sealed", "failed"}:
+            told = {key: message[key] for key in ("quality", "sha256", "reason") if key in message}
+            view = self.views.setdefault(message["index"], {"index": message["index"]})
+            view.update(told, state=kind)
+            self.sealed_now += kind == "sealed"
+            self.doing = None
+        elif kind in {"ask", "answered"}:
+            self.asks = str(message["scene"]) if kind == "ask" else None
+        elif kind in {"paused", "resumed"}:
+            self.resting, self.doing = kind == "paused", None
+
+    def counts(self) -> dict[str, Any]:
+        """Count views sealed, failed and planned; tell the seconds left at the present pace."""
+        states = Counter(view["state"] for view in self.views.values())
+        left = states.total() - states["sealed"] - states["failed"]
+        pace = (time.monotonic() - self._since) / self.sealed_now if self.sealed_now else None
+        return {
+            "sealed": states["sealed"],
+            "failed": states["failed"],
+            "total": states.total(),
+            "eta_s": round(pace * left, 1) if pace is not None and not self.resting else None,
+        }
+
+    def table(self) -> dict[str, Any]:
+        """List all views as JSON types."""
+        return {"job": self.job, "views": [self.views[i] for i in sorted(self.views)]}
 
 
 class Supervisor:
@@ -41,53 +171,48 @@ class Supervisor:
     def __init__(self, settings: Settings, store: Store, publish: Callable[[Event], None]) -> None:
         self.settings, self.store, self._publish = settings, store, publish
         self.progress = Progress()
-        self.previews = self.restarts = self.sealed = self.failed = 0
-        self.started = utc_now()
-        self._child: Child | None = None
+        self.counters: Counter[str] = Counter()  # sealed, failed, restarts
+        self._started = utc_now()
+        self._recorder: RecorderProcess | None = None
         self._wake = asyncio.Event()
         self._busy = self._stopping = self._closing = False
         self.reason = ""
-        self._recover()
-
-    def _recover(self) -> None:
-        if (job := self.store.next()) is None:
-            return
-        if job.state == "running":
-            self.store.move(job.id, "queued")
-        self.reason = "the daemon was started with work waiting: look at the station, then resume"
+        if (job := store.next()) is not None:
+            if job.state == "running":
+                store.move(job.id, "queued")
+            self.reason = "the daemon was started with work waiting: look at the station, then resume"
 
     # What people ask for -------------------------------------------------------------------------------------------
 
-    def add(self, wish: Mapping[str, Any]) -> tuple[Job, bool]:
+    def add(self, request: Mapping[str, Any]) -> tuple[Job, bool]:
         """Queue a job; see :meth:`Store.add`."""
-        check_scene_name(wish["scene"])
-        job, new = self.store.add(wish)
+        check_scene_name(request["scene"])
+        job, new = self.store.add(request)
         if new:
-            self._say("queued", job=job.table())
+            self._say("queued", job=asdict(job))
             self._wake.set()
         return job, new
 
-    def pause(self, reason: str = "paused by the operator") -> None:
+    def pause(self) -> None:
         """Rest at the next safe point; no further job is begun."""
-        self.reason = self.reason or reason
-        if self._child:
-            self._child.order("pause")
+        self.reason = self.reason or "paused by the operator"
+        self._order("pause")
         self._tell_state()
 
     def resume(self) -> None:
         """Go on."""
         self.reason = ""
-        if self._child and not self._stopping:
-            self._child.order("resume")
+        if not self._stopping:
+            self._order("resume")
         self._wake.set()
         self._tell_state()
 
     def stop(self) -> None:
         """Stop the arm now, give the job in hand up, and rest. Always possible."""
         self._stopping = self._busy
-        if self._child:
-            self._child.order("stop")
-            asyncio.get_running_loop().call_later(GRACE, self._child.kill)
+        self._order("stop")
+        if self._recorder:
+            asyncio.get_running_loop().call_later(GRACE, self._recorder.kill)
         self.reason = "stopped by the operator"
         self._tell_state()
 
@@ -98,53 +223,52 @@ class Supervisor:
             self.stop()
         elif job.state == "queued":
             job = self.store.move(number, "stopped", "cancelled")
-            self._say("cancelled", job=job.table())
+            self._say("cancelled", job=asdict(job))
         return job
 
     def confirm(self) -> None:
-        """The scene is placed."""
-        if self._child:
-            self._child.order("confirm")
+        """Pass on that the scene is placed."""
+        self._order("confirm")
+
+    def _order(self, verb: str) -> None:
+        if self._recorder:
+            self._recorder.order(verb)
 
     # What it works on ----------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
         """Work until closed."""
         async with asyncio.TaskGroup() as tasks:
-            health = tasks.create_task(self._tell_health())
+            health = tasks.create_task(self._watch_health())
             while not self._closing:
                 job = None if self.reason else self.store.next()
                 if job is None:
                     self._wake.clear()
                     await self._wake.wait()
-                else:
-                    await self._try(job)
+                    continue
+                try:
+                    await self._work_on(job)
+                except (
+                    DiskFull
+                ) as err:  # too full to note the job's end: it stays as it is, for when there is room
+                    self.reason = f"{err.message}: {err.hint}"
+                    self._rest()
             health.cancel()
 
     async def close(self) -> None:
         """Stop the arm, let the view in hand be sealed or rolled back, and end; the job stays in the queue."""
         self._closing = True
         self._wake.set()
-        if self._child:
-            self._child.order("stop")
-            await self._child.end(GRACE)
-
-    async def _try(self, job: Job) -> None:
-        """Work on a job; a disk too full to note its end leaves it as it is, for when there is room."""
-        try:
-            await self._do(job)
-        except sqlite3.OperationalError as err:
-            if not is_full(err):
-                raise
-            self.reason = f"{self.settings.state.root}: the disk takes no more: free some space, then resume"
-            self._rest()
+        if self._recorder:
+            self._recorder.order("stop")
+            await self._recorder.end()
 
     def _rest(self) -> None:
-        """No job is in hand."""
+        """Have no job in hand."""
         self._busy = self._stopping = False
         self.progress.end()
 
-    async def _do(self, job: Job) -> None:
+    async def _work_on(self, job: Job) -> None:
         """Run recorders on a job until its end is decided."""
         self.store.move(job.id, "running")
         self._busy = True
@@ -155,54 +279,49 @@ class Supervisor:
             before = self.progress.sealed_now
             last = await self._record(job)
             crashes = crashes + 1 if self.progress.sealed_now == before else 1
-            if last or self._stopping or self._closing or not self._may_restart(crashes):
+            # A real arm never moves again by itself after a crash.
+            restarts = self.progress.simulated is not False and crashes <= len(_BACKOFF) and not self.reason
+            if last or self._stopping or self._closing or not restarts:
                 break
-            self.restarts += 1
+            self.counters["restarts"] += 1
             self._say("log", text=f"the recorder died; started again ({crashes})")
             await asyncio.sleep(_BACKOFF[crashes - 1])
         self._decide(job, last)
         self._rest()
         self._tell_state()
 
-    def _may_restart(self, crashes: int) -> bool:
-        """A real arm never moves again by itself after a crash."""
-        return self.progress.simulated is not False and crashes <= len(_BACKOFF) and not self.reason
-
     async def _record(self, job: Job) -> dict[str, Any]:
-        """Run one recorder; return its last words, empty when it died."""
+        """Run one recorder; return its last message, empty when it died."""
         settings = self.settings
-        wish = {
-            **job.table(),
+        told = {
+            **asdict(job),
             "recording": str(settings.root / job.recording),
             "station": str(settings.station) if settings.station else None,
             "allow_motion": settings.allow_motion,
             "previews": str(settings.state.previews),
         }
-        child = self._child = await start(wish, settings.worker)
+        self._recorder = await RecorderProcess.start(told, settings)
         if self.reason:
-            child.order("pause")
+            self._order("pause")
         if self._stopping or self._closing:
-            child.order("stop")
+            self._order("stop")
         last: dict[str, Any] = {}
-        async for message in child.lines():
-            if message["kind"] in {"done", "stopped", "error"}:
+        async for message in self._recorder.messages():
+            if message["kind"] in _ENDS:
                 last = message
             else:
                 self._hear(message)
-        await child.end(GRACE)
-        self._child = None
+        await self._recorder.end()
+        self._recorder = None
         return last
 
     def _hear(self, message: dict[str, Any]) -> None:
         self.progress.hear(message)
         kind = message.pop("kind")
+        self.counters[kind] += 1
         if kind == "sealed":
-            self.previews += 1
-            self.sealed += 1
-            message["preview"] = self.previews
-        self.failed += kind == "failed"
-        if kind in _KEPT:
-            self._say(kind, job=self.progress.job, progress=self.progress.counts(), **message)
+            message["preview"] = self.counters["sealed"]
+        self._say(kind, job=self.progress.job, progress=self.progress.counts(), **message)
 
     def _decide(self, job: Job, last: Mapping[str, Any]) -> None:
         """Put the job where it belongs after its recorder ended."""
@@ -234,30 +353,59 @@ class Supervisor:
             return "paused"
         return "pausing" if self.reason else "recording"
 
-    @property
-    def silence(self) -> float | None:
-        """Seconds since the recorder's last sign of life; ``None`` when there is no recorder."""
-        return self._child.silence if self._child else None
+    def snapshot(self) -> dict[str, Any]:
+        """Tell everything but the table of views, as JSON types."""
+        progress, store = self.progress, self.store
+        return {
+            "version": __version__,
+            "pid": os.getpid(),
+            "started_utc": self._started,
+            "phase": self.phase,
+            "reason": self.reason,
+            "allow_motion": self.settings.allow_motion,
+            "simulated": progress.simulated,
+            "root": str(self.settings.root),
+            "station": str(self.settings.station or "simulated"),
+            "job": asdict(store.job(progress.job)) if progress.job is not None else None,
+            "progress": progress.counts(),
+            "doing": progress.doing,
+            "asks": progress.asks,
+            "queue": store.counts(),
+            "preview": self.counters["sealed"],
+            "last_event": store.last_event(),
+            "health": self._health(),
+        }
+
+    def _health(self) -> dict[str, Any]:
+        """Recorder and disk."""
+        silence = self._recorder.silence if self._recorder else None
+        free = None
+        with contextlib.suppress(OSError):
+            free = shutil.disk_usage(self.settings.root).free
+        return {
+            "recorder": "none" if silence is None else "alive" if silence < _SILENT else "silent",
+            "silence_s": round(silence, 1) if silence is not None else None,
+            "disk_free_bytes": free,
+            "restarts": self.counters["restarts"],
+        }
+
+    async def _watch_health(self) -> None:
+        """Tell now and then how things are, and kill a recorder that hangs."""
+        while True:
+            if self._recorder and self._recorder.silence > self.settings.silence_limit:
+                words = "tofcapture: the recorder has been silent too long: killed"
+                print(words, file=sys.stderr, flush=True)
+                self._recorder.kill()
+            self._publish(Event(0, utc_now(), "health", self._health()))
+            await asyncio.sleep(_HEALTH)
 
     def _tell_state(self) -> None:
-        self._say("state", state=snapshot(self))
+        self._say("state", state=self.snapshot())
 
     def _say(self, kind: str, **data: object) -> None:
         """Keep and publish an event; a full disk is no reason to fall silent."""
         try:
             event = self.store.remember(kind, data)
-        except sqlite3.OperationalError as err:
-            if not is_full(err):
-                raise
+        except DiskFull:
             event = Event(0, utc_now(), kind, data)
         self._publish(event)
-
-    async def _tell_health(self) -> None:
-        while True:
-            if self._child and self._child.silence > _LOST:
-                print(
-                    "tofcapture: the recorder has been silent too long: killed", file=sys.stderr, flush=True
-                )
-                self._child.kill()
-            self._publish(Event(0, utc_now(), "health", health(self)))
-            await asyncio.sleep(_HEALTH)

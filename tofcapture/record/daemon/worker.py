@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from tofcapture.devices import Operator
 from tofcapture.errors import BusyError, DeviceError, MotionRefused, TofError
-from tofcapture.frames import View
-from tofcapture.record.watch import DiskFull, Stopped, Watch
+from tofcapture.record.observer import Observer, Stopped
+from tofcapture.record.resources import DiskFull
 
 if TYPE_CHECKING:
     from tofcapture.devices.station import Station
+    from tofcapture.frames import View
     from tofcapture.record.plan import Plan
 
 ALIVE = 0.5  # s between signs of life
@@ -32,13 +33,7 @@ _PATIENCE = 1800.0  # s that an operator may take to place a scene
 
 
 class Link:
-    """Both ends of the line to the daemon.
-
-    Parameters
-    ----------
-    orders, out
-        Text files of one JSON object a line.
-    """
+    """Both ends of the line to the daemon: text files of one JSON object a line."""
 
     def __init__(self, orders: TextIO, out: TextIO) -> None:
         self._orders, self._out = orders, out
@@ -127,7 +122,7 @@ class PageOperator(Operator):
         self._link.ask(scene)
 
 
-class Reporter(Watch):
+class Reporter(Observer):
     """Tells the daemon what the recorder does; passes pause and stop on to it."""
 
     def __init__(self, link: Link, previews: Path) -> None:
@@ -146,9 +141,8 @@ class Reporter(Watch):
         ]
         self._link.tell("planned", views=views, wanted=plan.wanted, repaired=repaired)
 
-    def before_view(self, index: int) -> None:
+    def before_view(self, index: int) -> None:  # noqa: ARG002
         """Rest while paused."""
-        del index
         self._link.rest()
 
     def step(self, index: int, step: str) -> None:
@@ -175,6 +169,7 @@ class Reporter(Watch):
 
 def _work(job: Mapping[str, Any], link: Link) -> dict[str, Any]:
     """Open the station, record, and say what came of it."""
+    # Imported late: orders are followed, and signs of life given, while the libraries load.
     from tofcapture.devices.station import open_station
     from tofcapture.record.recorder import record
 
@@ -188,23 +183,19 @@ def _work(job: Mapping[str, Any], link: Link) -> dict[str, Any]:
             )
         link.tell("opened", station=station.describe(), simulated=station.simulated)
         staffed = replace(station, operator=PageOperator(link)) if station.operator.person else station
-        watch = Reporter(link, Path(job["previews"]))
+        reporter = Reporter(link, Path(job["previews"]))
         result = record(
-            staffed, job["scene"], Path(job["recording"]), job["views"], job["frames"], watch=watch
+            staffed, job["scene"], job["recording"], job["views"], job["frames"], observer=reporter
         )
-    taken, kept, failed = (list(x) for x in (result.recorded, result.kept, result.failed))
-    return {"recorded": taken, "kept": kept, "failed": failed, "reasons": list(result.reasons)}
+    return {"failed": list(result.failed), "reasons": list(result.reasons)}
 
 
 def _error(err: BaseException) -> dict[str, Any]:
-    """What the daemon must know of an error: the words, and whether a person can lift what caused it."""
-    message = err.message if isinstance(err, TofError) else f"{type(err).__name__}: {err}"
-    lifted = isinstance(err, (DeviceError, BusyError, DiskFull))
+    """Tell of an error: the words, and whether a person can lift what caused it."""
     return {
-        "message": message,
+        "message": err.message if isinstance(err, TofError) else f"{type(err).__name__}: {err}",
         "hint": getattr(err, "hint", ""),
-        "name": type(err).__name__,
-        "lifted": lifted,
+        "lifted": isinstance(err, (DeviceError, BusyError, DiskFull)),
     }
 
 

@@ -1,0 +1,374 @@
+"""The API: what may be asked, what is checked of it, what is answered. One table of routes serves and documents.
+
+``python -m tofcapture.record.daemon.app`` prints the OpenAPI document that is made of the routes (docs/openapi.json).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+from aiohttp import web
+
+from tofcapture import __version__
+from tofcapture.errors import UsageError
+from tofcapture.record.daemon.events import Streams
+from tofcapture.record.daemon.guard import BODY_LIMIT, Guard, Handler, body_of
+from tofcapture.record.daemon.preview import NAMES
+from tofcapture.record.daemon.store import Job
+from tofcapture.record.daemon.supervisor import Supervisor
+
+PAGE = Path(__file__).with_name("page")
+PAGE_FILES = {
+    "/": ("index.html", "text/html"),
+    "/app.js": ("app.js", "text/javascript"),
+    "/picture.js": ("picture.js", "text/javascript"),
+    "/style.css": ("style.css", "text/css"),
+}
+
+_STREAM = "/v1/events"
+
+Schema = dict[str, Any]
+_TYPES = {int: ["integer"], str: ["string"], int | None: ["integer", "null"], str | None: ["string", "null"]}
+
+
+def _object(required: str = "", /, **properties: Schema) -> Schema:
+    out: Schema = {"type": "object", "properties": properties}
+    return {**out, "required": required.split()} if required else out
+
+
+def _name(description: str) -> Schema:
+    return {"type": "string", "pattern": r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$", "description": description}
+
+
+def _number(low: int, high: int, **more: Any) -> Schema:
+    return {"type": "integer", "minimum": low, "maximum": high, **more}
+
+
+def _ref(name: str) -> Schema:
+    return {"$ref": f"#/components/schemas/{name}"}
+
+
+_NOTHING_ELSE = {"additionalProperties": False}
+JOB_REQUEST = _NOTHING_ELSE | _object(
+    "scene recording",
+    scene=_name("what stands on the table; 'calibration' for the board"),
+    recording=_name("folder under the daemon's root"),
+    views=_number(1, 1000, default=25),
+    frames=_number(1, 1000, default=10),
+    seed=_number(0, 2**31 - 1, description="of the simulated station"),
+    request_id=_name("made by the client; asking twice queues once"),
+)
+_JOB = _object(
+    " ".join(get_type_hints(Job)),
+    **{key: {"type": _TYPES[kind]} for key, kind in get_type_hints(Job).items() if key != "state"},
+    state={"enum": ["queued", "running", "done", "failed", "stopped"]},
+)
+_TEXT: Schema = {"type": "string"}
+SCHEMAS = {
+    "Error": _object("error", error=_object("kind message hint", kind=_TEXT, message=_TEXT, hint=_TEXT)),
+    "Job": _JOB,
+    "Jobs": _object("jobs", jobs={"type": "array", "items": _ref("Job")}),
+    "JobRequest": JOB_REQUEST,
+    "Nothing": _NOTHING_ELSE | _object(),
+    "Page": _object("url", url={"type": ["string", "null"]}),
+    "State": _object(
+        "version phase reason job progress doing queue health last_event",
+        phase={"enum": ["idle", "recording", "pausing", "paused", "stopping"]},
+        reason=_TEXT,
+        job={"oneOf": [_ref("Job"), {"type": "null"}]},
+        progress={"type": "object"},
+        root=_TEXT,
+        last_event={"type": "integer"},
+    ),
+    "Views": _object("job views", views={"type": "array", "items": {"type": "object"}}),
+    "Document": _object(),
+}
+ERRORS = {
+    400: "the body is no JSON object, or a parameter is wrong",
+    401: "no token, or a wrong one (TCP only)",
+    403: "foreign Host or Origin, another user, or the header X-Tofcapture is missing",
+    404: "there is no such thing",
+    408: "the body came too slowly",
+    409: "it contradicts what was asked before, or the queue is full",
+    413: "the body is larger than 64 KiB",
+    415: "the body is not application/json",
+    422: "a field is missing, unknown, or has a wrong value",
+    503: "too many event streams",
+}
+PARAMETERS: dict[str, Schema] = {
+    "number": {"in": "path", "required": True, "schema": _number(1, 2**53)},
+    "name": {"in": "path", "required": True, "schema": {"enum": list(NAMES)}},
+    "after": {
+        "in": "query",
+        "schema": _number(0, 2**53),
+        "description": "start behind this event; the header Last-Event-ID does the same",
+    },
+    "X-Tofcapture": {
+        "in": "header",
+        "required": True,
+        "schema": {"type": "string", "enum": ["1"]},
+        "description": "no page of another site can send it unasked",
+    },
+}
+
+
+def check(schema: Mapping[str, Any], value: Any, where: str = "body") -> None:
+    """Make sure that a value is what a schema of this module says.
+
+    Raises
+    ------
+    UsageError
+        The first thing that is wrong.
+    """
+    if schema["type"] == "object":
+        if not isinstance(value, dict):
+            raise UsageError(f"{where}: expected an object, got {type(value).__name__}")
+        known = schema["properties"]
+        if unknown := sorted(value.keys() - known.keys()):
+            raise UsageError(
+                f"{where}: does not know {unknown[0][:80]!r}", hint=f"it knows {', '.join(known)}"
+            )
+        if missing := [key for key in schema.get("required", ()) if key not in value]:
+            raise UsageError(f"{where}: {missing[0]} is missing")
+        for key, found in value.items():
+            check(known[key], found, f"{where}.{key}")
+    elif schema["type"] == "string":
+        # fullmatch: in Python "$" also matches ahead of a newline.
+        if not isinstance(value, str) or not re.fullmatch(schema["pattern"].strip("^$"), value):
+            raise UsageError(f"{where}: expected text like {schema['pattern']}, got {str(value)[:80]!r}")
+    else:
+        low, high = schema["minimum"], schema["maximum"]
+        if type(value) is not int or not low <= value <= high:
+            raise UsageError(f"{where}: expected a whole number from {low} to {high}, got {str(value)[:40]}")
+
+
+@dataclass(frozen=True)
+class Route:
+    """Something that may be asked: served by ``handler``, a method of :class:`Api`, and documented by its docstring.
+
+    ``answer`` names a schema or a media type. ``body`` names the schema of the body, which every POST has. ``codes`` are the
+    answers besides 200 and the errors of every route.
+    """
+
+    method: str
+    path: str
+    handler: Callable[..., Any]
+    answer: str
+    codes: tuple[int, ...]
+    body: str | None
+
+    def document(self) -> Schema:
+        """Write the route's OpenAPI operation."""
+        named = re.findall(r"{(\w+)}", self.path) + (["after"] if self.path == _STREAM else [])
+        usual = (200, 400, 401, 403, 408, 413, 415, 422) if self.body else (200, 401, 403)
+        known = self.answer in SCHEMAS
+        media, schema = ("application/json", _ref(self.answer)) if known else (self.answer, _TEXT)
+        answer = {"description": self.answer, "content": {media: {"schema": schema}}}
+        error = {"application/json": {"schema": _ref("Error")}}
+        codes = sorted({*usual, *self.codes, *([404] if "{" in self.path else [])})
+        out: Schema = {
+            "summary": (self.handler.__doc__ or "").rstrip("."),
+            "responses": {
+                str(code): {"description": ERRORS[code], "content": error} if code in ERRORS else answer
+                for code in codes
+            },
+            "parameters": [
+                {"name": key, **PARAMETERS[key]} for key in (["X-Tofcapture"] if self.body else []) + named
+            ],
+        }
+        if self.body:
+            content = {"application/json": {"schema": _ref(self.body)}}
+            out["requestBody"] = {"required": True, "content": content}
+        return out
+
+    def bind(self, api: Api) -> Handler:
+        """Make the handler that aiohttp calls; it checks what was given against the schemas."""
+
+        async def handle(request: web.Request) -> web.StreamResponse:
+            given: dict[str, Any] = dict(request.match_info)
+            if self.body:
+                schema, body = SCHEMAS[self.body], await body_of(request)
+                check(schema, body)
+                given |= {k: s["default"] for k, s in schema["properties"].items() if "default" in s} | body
+            answer = self.handler(api, **given)
+            return answer if isinstance(answer, web.Response) else web.json_response(answer)
+
+        return handle
+
+
+ROUTES: list[Route] = []
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+
+
+def route(
+    method: str, path: str, answer: str, *codes: int, body: str | None = None
+) -> Callable[[_Method], _Method]:
+    """Serve and document a method of :class:`Api`; see :class:`Route`."""
+
+    def add(handler: _Method) -> _Method:
+        ROUTES.append(Route(method, path, handler, answer, codes, body))
+        return handler
+
+    return add
+
+
+def _job_number(text: str) -> int:
+    if text.isascii() and text.isdigit() and len(text) <= 16:
+        return int(text)
+    raise web.HTTPNotFound(reason="there is no such job")
+
+
+class Api:
+    """What one daemon does for each route."""
+
+    def __init__(self, supervisor: Supervisor, streams: Streams, guard: Guard) -> None:
+        self._do, self._streams, self._guard = supervisor, streams, guard
+        self.page_url: str | None = None
+
+    def application(self) -> web.Application:
+        """Route everything."""
+        app = web.Application(middlewares=[self._guard.middleware], client_max_size=BODY_LIMIT)
+        for known in ROUTES:
+            handler = self._streams.serve if known.path == _STREAM else known.bind(self)
+            app.router.add_route(known.method, known.path, handler)
+        for path, (name, kind) in PAGE_FILES.items():
+            app.router.add_get(path, _page_file(name, kind))
+        return app
+
+    @route("GET", "/v1/state", "State")
+    def state(self) -> Schema:
+        """Everything at a glance."""
+        return self._do.snapshot()
+
+    @route("GET", "/v1/views", "Views")
+    def views(self) -> Schema:
+        """Views of the job in hand, or of the last one."""
+        return self._do.progress.table()
+
+    @route("GET", "/v1/jobs", "Jobs")
+    def jobs(self) -> Schema:
+        """The newest 100 jobs, newest first."""
+        return {"jobs": [asdict(job) for job in self._do.store.newest()]}
+
+    @route("POST", "/v1/jobs", "Job", 201, 409, body="JobRequest")
+    def add(self, **request: Any) -> web.Response:
+        """Queue a scene; 201 when it is new, 200 when the same request was made before."""
+        job, new = self._do.add(request)
+        return web.json_response(asdict(job), status=201 if new else 200)
+
+    @route("GET", "/v1/jobs/{number}", "Job")
+    def job(self, number: str) -> Schema:
+        """One job."""
+        return asdict(self._do.store.job(_job_number(number)))
+
+    @route("POST", "/v1/jobs/{number}/cancel", "Job", body="Nothing")
+    def cancel(self, number: str) -> Schema:
+        """Take it out of the queue; a running one is stopped."""
+        return asdict(self._do.cancel(_job_number(number)))
+
+    @route("POST", "/v1/pause", "State", body="Nothing")
+    def pause(self) -> Schema:
+        """Rest after the view in hand."""
+        self._do.pause()
+        return self.state()
+
+    @route("POST", "/v1/resume", "State", body="Nothing")
+    def resume(self) -> Schema:
+        """Go on."""
+        self._do.resume()
+        return self.state()
+
+    @route("POST", "/v1/stop", "State", body="Nothing")
+    def stop(self) -> Schema:
+        """Stop the arm now and give the job up; always accepted."""
+        self._do.stop()
+        return self.state()
+
+    @route("POST", "/v1/confirm", "State", body="Nothing")
+    def confirm(self) -> Schema:
+        """Say that the scene that was asked for is placed."""
+        self._do.confirm()
+        return self.state()
+
+    @route("GET", _STREAM, "text/event-stream", 400, 503)
+    def events(self) -> None:
+        """What happens, as server-sent events, without end."""
+
+    @route("GET", "/v1/preview/{name}", "image/png")
+    def preview(self, name: str) -> web.Response:
+        """The latest picture."""
+        path = self._do.settings.state.previews / f"{name}.png"
+        if name not in NAMES or not path.exists():
+            raise web.HTTPNotFound(reason="there is no such picture yet")
+        return web.Response(body=path.read_bytes(), content_type="image/png")
+
+    @route("GET", "/v1/page", "Page")
+    def page(self) -> Schema:
+        """Where the page is, token included; null without TCP."""
+        return {"url": self.page_url}
+
+    @route("GET", "/openapi.json", "Document")
+    def openapi(self) -> Schema:
+        """The description of this API."""
+        return document()
+
+    @route("GET", "/metrics", "text/plain")
+    def metrics(self) -> web.Response:
+        """Numbers for Prometheus."""
+        found = self._do.snapshot()
+        health, counters = found["health"], self._do.counters
+        plain = {
+            "views_sealed_total": counters["sealed"],
+            "views_failed_total": counters["failed"],
+            "recorder_restarts_total": health["restarts"],
+            "recorder_up": int(health["recorder"] == "alive"),
+            "paused": int(found["phase"] == "paused"),
+            "disk_free_bytes": health["disk_free_bytes"] or 0,
+            "event_streams": len(self._streams),
+        }
+        values = {name: {"": value} for name, value in plain.items()}
+        values["jobs"] = {f'{{state="{state}"}}': n for state, n in found["queue"].items()}
+        values["http_responses_total"] = {f'{{code="{c}"}}': n for c, n in self._guard.codes.items()}
+        lines = []
+        for name, labelled in values.items():
+            lines.append(f"# TYPE tofcapture_{name} {'counter' if name.endswith('_total') else 'gauge'}")
+            lines += [f"tofcapture_{name}{label} {value}" for label, value in labelled.items()]
+        return web.Response(text="\n".join(lines) + "\n", content_type="text/plain")
+
+
+def _page_file(name: str, kind: str) -> Handler:
+    async def handle(request: web.Request) -> web.Response:
+        del request
+        return web.Response(body=(PAGE / name).read_bytes(), content_type=kind, charset="utf-8")
+
+    return handle
+
+
+def document() -> Schema:
+    """Write the OpenAPI document."""
+    paths: dict[str, Schema] = {}
+    for known in ROUTES:
+        paths.setdefault(known.path, {})[known.method.lower()] = known.document()
+    return {
+        "openapi": "3.1.0",
+        "info": {
+            "title": "tofcapture daemon",
+            "version": __version__,
+            "summary": "Records scenes, one after the other; over a Unix socket, or loopback TCP with a token.",
+        },
+        "paths": paths,
+        "security": [{"token": []}],
+        "components": {
+            "schemas": SCHEMAS,
+            "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
+        },
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps(document(), indent=1))

@@ -1,0 +1,134 @@
+"""What a recorder needs for itself: room on the disk, its recording, its arm."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import os
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tofcapture.errors import BusyError, ConfigError
+
+if TYPE_CHECKING:
+    from tofcapture.devices import Arm
+
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
+_VIEW_BYTES = 40e6  # a view of a full-size rig with truth, and room to spare
+_RESERVE_BYTES = 0.5e9
+
+
+class DiskFull(ConfigError):  # noqa: N818  the disk's state
+    """The disk takes no more; what is sealed stays, the same command goes on when there is room."""
+
+
+def is_full(error: BaseException) -> bool:
+    """Tell whether an error says that the disk takes no more: full, over quota, at a limit, or read-only."""
+    if isinstance(error, OSError) and error.errno in _NO_ROOM:
+        return True
+    text = str(error).lower()
+    if isinstance(error, sqlite3.OperationalError):
+        return "full" in text or "readonly" in text
+    # HDF5 hides errno in its own words, and fails once more when the file is closed.
+    return isinstance(error, (OSError, RuntimeError)) and "no space left" in text
+
+
+@contextmanager
+def full_disk_named(where: Path) -> Iterator[None]:
+    """Turn every way in which libraries say that the disk is full into :class:`DiskFull`."""
+    try:
+        yield
+    except (OSError, RuntimeError, sqlite3.OperationalError) as err:
+        if not is_full(err):
+            raise
+        raise DiskFull(
+            f"{where}: the disk takes no more: {str(err).partition('(')[0].strip()}",
+            hint="free some space, then run the same again",
+        ) from err
+
+
+def check_space(recording: Path, views: int) -> None:
+    """Refuse to begin what the disk cannot hold.
+
+    Raises
+    ------
+    DiskFull
+        There is no room for so many views.
+    """
+    free = shutil.disk_usage(recording).free
+    needed = views * _VIEW_BYTES + _RESERVE_BYTES
+    if free < needed:
+        raise DiskFull(
+            f"{recording}: expected {needed / 1e9:.1f} GB of free disk, got {free / 1e9:.1f} GB",
+            hint="free some space, or ask for fewer views",
+        )
+
+
+@contextmanager
+def hold_file(path: Path, what: str, hint: str) -> Iterator[None]:
+    """Hold a lock file that names this process; the lock goes with the process, however that ends.
+
+    Raises
+    ------
+    BusyError
+        Another process holds it: ``what``, its id, ``hint``.
+    """
+    with path.open("a+", encoding="ascii") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as err:
+            file.seek(0)
+            raise BusyError(f"{what} (process {file.read().strip() or 'unknown'})", hint=hint) from err
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        yield
+
+
+@contextmanager
+def hold_recording(recording: Path) -> Iterator[None]:
+    """Hold a recording for writing.
+
+    Raises
+    ------
+    BusyError
+        Another recorder holds it.
+    """
+    # Not the database itself: closing any handle of it would drop SQLite's own locks.
+    with hold_file(recording / ".lock", f"{recording}: another recorder is at work", "wait for it to end"):
+        yield
+
+
+@contextmanager
+def hold_arm(arm: Arm) -> Iterator[None]:
+    """Hold a real arm for this process: two recorders of two recordings must not move it in turn.
+
+    Raises
+    ------
+    BusyError
+        Another process of this machine moves it.
+    """
+    if arm.simulated:
+        yield
+        return
+    info = arm.describe()
+    name = hashlib.sha256(f"{info.model}|{info.serial}".encode()).hexdigest()[:16]
+    path = Path(tempfile.gettempdir()) / f"tofcapture-arm-{name}.lock"
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+    except PermissionError:  # another user's file in a sticky folder can be locked, but not created
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    with os.fdopen(handle):
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as err:
+            raise BusyError(
+                f"the arm {info.model} {info.serial} is moved by another process", hint="tofcapture status"
+            ) from err
+        yield
