@@ -21,12 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.alignment.averaged_icp import average_transforms
-from calibration.alignment.fusion import about, fuse, twist_about
-from calibration.alignment.joint_icp import joint_icp
-from calibration.alignment.joint_views import joint_view_of
-from calibration.evidence.evidence import alignment_error
-from calibration.registration.backends import register_open3d
+from calibration.alignment.averages import about, average_transforms, fuse, twist_about
+from calibration.alignment.joint import joint_icp
+from calibration.alignment.methods import alignment_error
+from calibration.alignment.views import joint_view_of
+from calibration.registration.backends import register
 from calibration.registration.clouds import WORKING_DEPTH, Cloud, tof_depth
 from tofcapture.devices.sim import stereo as stereos
 from tofcapture.devices.sim.config import Constants, read_constants
@@ -136,14 +135,14 @@ def plain(views: list[View], dense: list[Cloud], T_tof_stereo: Float64) -> tuple
     No rims, no range residual, no choice of surface: what the libraries give without what this package adds.
     """
     results = [
-        register_open3d(whole_cloud(view), cloud, invert(T_tof_stereo))
+        register("open3d", whole_cloud(view), cloud, invert(T_tof_stereo))
         for view, cloud in zip(views, dense, strict=True)
     ]
     centre = np.mean([transform_points(invert(r.T_target_source), r.centre) for r in results], axis=0)
     average = average_transforms([r.T_target_source for r in results], centre)
     # A registration's information is of a motion in target axes, on the left of the transform; that of its inverse is on the right.
     informations = [about(r.information, r.centre) for r in results]
-    return invert(average.T), fuse([invert(r.T_target_source) for r in results], informations).T
+    return invert(average.T), fuse([invert(r.T_target_source) for r in results], informations)
 
 
 def whole_cloud(view: View) -> Float64:
@@ -163,7 +162,7 @@ def run_seed(pool: int, seed: int, cache: Path) -> list[dict[str, Any]]:
         for i, pose in enumerate(poses_of(pool, seed))
     ]
     start, true = world.nominal_rig().T_tof_stereo, world.true_rig.T_tof_stereo
-    reduced = [joint_view_of(view, str(view.index)) for view in views]
+    reduced = [joint_view_of(view) for view in views]
     averaged, weighted = plain(views, [view.surface for view in reduced], start)
     rows = [_row("plain averaged", averaged, true), _row("plain weighted", weighted, true)]
     joint = joint_icp(reduced, start)

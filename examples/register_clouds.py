@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.registration.backends import register_open3d
+from calibration.registration.backends import register
 from calibration.registration.clouds import stereo_cloud, surface_points, tof_depth
 from tofcapture.files.view import read_view
 from tofcapture.poses import invert, rotation_angle
@@ -18,7 +18,7 @@ def main(path: str) -> None:
     source = surface_points(view.tof, depth)  # (N, 3), ToF frame
     target = stereo_cloud(view.stereo)  # points and normals, stereo frame
     start = invert(view.rig.T_tof_stereo)  # T_stereo_tof
-    found = register_open3d(source, target, start)
+    found = register("open3d", source, target, start)
     moved = found.T_target_source @ invert(start)
     print(
         f"{len(source)} points into {len(target.points)}: RMSE {1e3 * found.rmse:.2f} mm, fitness {found.fitness:.2f}"

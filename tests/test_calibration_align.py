@@ -9,11 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.align import _common_rig, align
-from calibration.alignment.range_residual import RangeResidual, fit_range_residual, no_residual
-from calibration.board.rims import rim_cloud, stereo_rims, tof_rims
+from calibration.align import align
+from calibration.alignment.averages import average_transforms
+from calibration.alignment.methods import alignment_error
+from calibration.alignment.rounds import RangeResidual, Solution, fit_range_residual, no_residual
 from calibration.cli.align import ALIGN
-from calibration.evidence.evidence import alignment_error
+from calibration.evidence.evidence import evidence_of
 from calibration.registration.clouds import (
     Cloud,
     grid_normals,
@@ -22,8 +23,15 @@ from calibration.registration.clouds import (
     surface_points,
     tof_depth,
 )
-from calibration.registration.gate import Refusal, check_registration, measure_registration, residuals
-from calibration.registration.pairs import pair_of
+from calibration.registration.gate import (
+    Refusal,
+    Registration,
+    check_registration,
+    measure_registration,
+    residuals,
+)
+from calibration.registration.pairs import Pair, pair_of
+from calibration.registration.rims import rim_cloud, stereo_rims, tof_rims
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, QualityError
@@ -220,6 +228,57 @@ def test_evidence_tells_every_pair(aligned):
     assert [pair["view"] for pair in evidence["pairs"]] == list(evidence["provenance"]["inputs"])
 
 
+def test_numbers_of_evidence_are_those_of_the_registrations():
+    """Of known registrations every number is the hand-computed one, in its unit; the checks and the verdict follow from them."""
+    at = np.array([0.0, 0.0, 0.8])
+    moved = [
+        0.0,
+        1e-3,
+        -1e-3,
+        0.05,
+        0.0,
+    ]  # m along x; the fourth is an outlier, the last did not pass the gate
+    registrations = [
+        Registration(poses.transform(np.eye(3), [x, 0, 0]), 900, 0.002, 0.6, np.eye(6), 7.0, at, np.zeros(6))
+        for x in moved
+    ]
+    lost = replace(registrations[4], inliers=0, rmse=np.nan, condition=np.inf, fitness=0.0)
+    refusals = [None] * 4 + [Refusal.NO_OVERLAP]
+    average = average_transforms([r.T_target_source for r in registrations[:4]], at)
+    residual = replace(
+        no_residual(TOF, 100e6), coefficients=np.array([0.004, 1e-5, 0, 0, 0.001, -0.002, 0, 0])
+    )
+    solution = Solution([*registrations[:4], lost], refusals, average, [0, 1, 2, 3], at, residual)
+    rig = Rig(TOF, STEREO, np.eye(4), np.eye(4))
+    none = Cloud(np.zeros((0, 3)), np.zeros((0, 3)))
+    pairs = [
+        Pair(f"view-{i:03d}.h5", f"{i}", np.zeros((0, 3)), none, rig, 100e6, np.eye(4)) for i in range(5)
+    ]
+    start = poses.exp([0.0, 0.012, 0.0, 0.0, 0.0, np.radians(4.0)])
+    found = evidence_of(pairs, solution, "open3d", start, np.eye(4), {"method": "averaged"})
+    assert (found["views"], found["used"], found["verdict"]) == (5, 3, "WARN")
+    assert [p["reason"] for p in found["pairs"]] == ["", "", "", "outlier", "no overlap"]
+    assert found["spread"] == {"rotation_deg": 0.0, "translation_mm": pytest.approx(1.0)}
+    assert found["standard_error"]["translation_mm"] == pytest.approx(1 / np.sqrt(3))
+    assert found["pairs"][1] == {
+        "view": "view-001.h5", "accepted": True, "reason": "", "rmse_mm": 2.0, "inliers": 900, "fitness": 0.6, "condition": 7.0,
+        "rotation_from_mean_deg": 0.0, "translation_from_mean_mm": pytest.approx(1.0),
+    }  # fmt: skip
+    assert found["pairs"][3]["translation_from_mean_mm"] == pytest.approx(50.0)
+    assert [found["pairs"][4][key] for key in ("rmse_mm", "condition", "translation_from_mean_mm")] == [
+        None
+    ] * 3
+    assert found["range_residual"]["harmonics"] == [[1, 0, 0], [2, 0.001, -0.002], [4, 0, 0]]
+    assert (found["range_residual"]["offset"], found["working_point_m"]) == (0.004, [0, 0, 0.8])
+    assert found["truth"] == {"rotation_error_deg": 0.0, "translation_error_mm": 0.0}
+    judged = {c["words"]: (c["value"], c["verdict"]) for c in found["checks"]}
+    assert judged["board views used"] == ("3", "WARN")
+    assert judged["median residual of the used views"] == ("2 mm", "PASS")
+    assert judged["turned from the initial guess"] == ("4 deg", "WARN")
+    assert judged["moved from the initial guess"] == ("12 mm", "PASS")
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+
+
 def test_same_recording_gives_the_same_bytes(recording, aligned):
     """A second run, started from the first one's files, writes identical files."""
     before = [(recording / name).read_bytes() for name in ("rig.toml", "evidence.json")]
@@ -249,12 +308,13 @@ def test_unknown_backend_fails_before_any_work(tmp_path):
         align(tmp_path, backend="teaser")
 
 
-def test_views_of_another_camera_are_refused(views):
+def test_views_of_another_camera_are_refused(views, tmp_path):
     """One recording holds one rig."""
-    pairs = [pair_of(view, f"view-{view.index}", "") for view in views[:2]]
-    other = replace(pairs[1], rig=replace(pairs[1].rig, tof=replace(TOF, fx=200.0)))
+    other = replace(views[2], rig=replace(views[2].rig, tof=replace(TOF, fx=200.0)))
+    for view in (*views[:2], other):
+        write_view(view_path(tmp_path, "calibration", view.index), view)
     with pytest.raises(DataError, match="other cameras"):
-        _common_rig([pairs[0], other])
+        align(tmp_path)
 
 
 def test_view_that_saw_nothing_is_an_empty_pair():
@@ -316,18 +376,17 @@ def test_range_residual_recovers_a_wave():
     """A wave put on the ranges of six tilted planes is found to a tenth of a millimetre with their poses unknown."""
     rng = np.random.default_rng(0)
     truth = RangeResidual(TOF, 100e6, np.array([0, 0, 0, 0, 0.001, -0.002, 0, 0]))
-    sources, targets, registrations = [], [], []
+    pairs, registrations = [], []
     for _ in range(6):
         normal = np.append(rng.uniform(-0.5, 0.5, 2), 1.0)
         exact = (TOF.rays * (rng.uniform(0.6, 1.0) / (TOF.rays @ normal))[..., None])[::2, ::2].reshape(-1, 3)
         unit = -normal / np.linalg.norm(normal)
         target = Cloud(exact, np.tile(unit, (len(exact), 1)))
-        sources.append(
-            exact + exact * (truth.terms(exact) @ truth.coefficients / np.linalg.norm(exact, axis=1))[:, None]
-        )
-        targets.append(target)
-        registrations.append(measure_registration(np.eye(4), sources[-1], target))
-    found = fit_range_residual(sources, targets, registrations, no_residual(TOF, 100e6))
+        longer = truth.terms(exact) @ truth.coefficients / np.linalg.norm(exact, axis=1)
+        source = exact + exact * longer[:, None]
+        pairs.append(Pair("", "", source, target, Rig(TOF, STEREO, np.eye(4), np.eye(4)), 100e6, None))
+        registrations.append(measure_registration(np.eye(4), source, target))
+    found = fit_range_residual(pairs, registrations, no_residual(TOF, 100e6))
     np.testing.assert_allclose(found.coefficients[4:6], truth.coefficients[4:6], atol=2e-4)
 
 
@@ -339,7 +398,8 @@ def test_align_command_reports_as_text_and_json(recording, monkeypatch):
     parser = argparse.ArgumentParser()
     ALIGN.configure(parser)
     outcome = ALIGN.run(parser.parse_args([str(recording)]))
-    assert "verdict: " in outcome.text
+    assert f"verdict: {evidence['verdict']}" in outcome.text
+    assert all(c["cause"] in outcome.text for c in evidence["checks"] if c["verdict"] != "PASS")
     assert outcome.text.count("view-") == 6
     data = json.loads(json.dumps(outcome.data))
     assert data["rotation_error_deg"] < 0.1

@@ -6,24 +6,25 @@ import argparse
 import re
 import struct
 import xml.etree.ElementTree as ET
+from io import StringIO
 from pathlib import Path
 
+import ezdxf
 import numpy as np
 import pytest
 
 from calibration.board.coverage import coverage, meter
 from calibration.board.detector import detect
-from calibration.board.drawing import dxf, stl, svg
-from calibration.board.fit import Sight
+from calibration.board.drawing import describe, dxf, stl, svg
+from calibration.board.fit import Model, Sight, on_front, refine
 from calibration.board.geometry import Board, board_from, distance_to_ring, inside, load_board, symmetries
-from calibration.board.model import Model, on_front
 from calibration.cli.calibrate import COMMAND
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.shapes import BOARD_SIZE
 from tofcapture.devices.sim.shapes import board as simulated_board
 from tofcapture.errors import ConfigError, QualityError
-from tofcapture.meshes import circle, rectangle, volume
-from tofcapture.poses import exp, invert, look_at, rotation_angle, transform_points
+from tofcapture.meshes import circle, extrude, rectangle
+from tofcapture.poses import exp, invert, look_at, rotation_angle, rotation_log, transform_points
 
 CAMERA = Camera(240, 180, 190.6186, 200.7526, 116.8406, 101.4767)
 BLANK = {
@@ -42,7 +43,8 @@ def disc(name="disc", centre=(0.05, 0.04), radius=0.03):
 
 def test_default_board_is_the_simulators():
     """The packaged board and the simulator's are one mesh, vertex by vertex."""
-    (v, t), (sim_v, sim_t) = load_board().mesh(), simulated_board()
+    board = load_board()
+    (v, t), (sim_v, sim_t) = extrude(board.outline, board.thickness, board.rings[1:]), simulated_board()
     np.testing.assert_allclose(v, sim_v, atol=1e-12)
     np.testing.assert_array_equal(t, sim_t)
     assert load_board().thickness == BOARD_SIZE[2]
@@ -111,16 +113,16 @@ def test_svg_is_true_to_scale():
 
 
 def test_dxf_reads_back():
-    """Group codes come in pairs; circles and corners are the board's, in millimetres."""
+    """It is R12; circles and corners are the board's, in millimetres, on the layer to cut."""
     board = load_board()
-    lines = dxf(board).splitlines()
-    pairs = list(zip([int(c) for c in lines[::2]], lines[1::2], strict=True))
-    assert (1, "AC1009") in pairs
-    assert pairs[-1] == (0, "EOF")
-    radii = [float(v) for c, v in pairs if c == 40]
-    assert radii == [45.0, 30.0, 55.0]
-    assert sum(p == (0, "POLYLINE") for p in pairs) == 1 + 4
-    assert sum(p == (0, "VERTEX") for p in pairs) == 4 + 4 + 3 + 4 + 4
+    drawing = ezdxf.read(StringIO(dxf(board)))
+    assert drawing.dxfversion == "AC1009"
+    assert all(shape.dxf.layer == "CUT" for shape in drawing.modelspace())
+    assert [c.dxf.radius for c in drawing.modelspace().query("CIRCLE")] == [45.0, 30.0, 55.0]
+    lines = list(drawing.modelspace().query("POLYLINE"))
+    assert [len(line) for line in lines] == [4, 4, 3, 4, 4]
+    assert all(line.is_closed for line in lines)
+    np.testing.assert_allclose([v.dxf.location.vec2 for v in lines[0].vertices], 1e3 * board.outline)
 
 
 def test_stl_encloses_the_boards_volume():
@@ -132,7 +134,7 @@ def test_stl_encloses_the_boards_volume():
     records = np.frombuffer(data[84:], dtype=[("n", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")])
     a, b, c = np.moveaxis(records["v"].astype(float), 1, 0)
     enclosed = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
-    assert enclosed == pytest.approx(1e9 * volume(board.mesh()), rel=1e-5)
+    assert enclosed == pytest.approx(1e9 * describe(board)["volume_m3"], rel=1e-5)
 
 
 def test_board_command_writes_all_three(tmp_path):
@@ -194,6 +196,21 @@ def test_pose_is_found_whatever_the_range_error(tilt, turn, lean):
     assert found.fit.bias == pytest.approx(0.008, abs=0.0008)
     assert len(found.holes) >= 6  # seen from the front, the middle disc shows nothing but its wall
     assert np.linalg.eigvalsh(found.fit.covariance).min() > 0
+
+
+def test_the_stated_uncertainty_of_a_pose_covers_its_error():
+    """Over 20 draws the errors of the six components are about as large as their stated standard deviations, each for itself."""
+    model, T = Model(load_board()), pose()
+    standardised = []
+    for seed in range(20):
+        fit = refine(model, sight_of(model.board, T, noise=0.0007, bias=0.004, seed=seed), T)
+        turned = rotation_log(fit.T[:3, :3] @ T[:3, :3].T)
+        off = np.concatenate([fit.T[:3, 3] - T[:3, 3], turned])
+        standardised.append(off / np.sqrt(np.diag(fit.covariance)))
+        assert np.sqrt(np.diag(fit.covariance)[:3]).max() < 0.001
+    rms = np.sqrt(np.mean(np.square(standardised), axis=0))
+    assert (rms < 1.5).all()
+    assert (rms[2:] > 0.5).all()  # x and y hold a share that all rims of a camera have in common
 
 
 def test_a_board_seen_from_behind_is_turned_over():

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration.board.fit import Model, clear_of_walls
 from calibration.board.geometry import load_board
-from calibration.board.model import Model, clear_of_walls
 from calibration.cli import lens as lens_cli
 from calibration.cli.lens import report, table
 from calibration.lens.board import BoardSeen, fit_lens_to_board

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -13,11 +14,12 @@ from calibration.board.detector import BoardRefusal, detect, stereo_sight, tof_s
 from calibration.board.geometry import load_board
 from calibration.cli.align import _page
 from calibration.evidence.compare import OldRig, drift, drift_text, load_old, uncertainty
-from calibration.evidence.limits import LIMITS
-from calibration.evidence.page import charts, read_evidence, write_page
-from calibration.evidence.page.checks import check, image_medians, least_certain, worst
+from calibration.evidence.evidence import judged_evidence, read_evidence
+from calibration.evidence.page import charts, write_page
+from calibration.evidence.page.checks import image_medians
 from calibration.evidence.page.content import page_content
 from calibration.evidence.page.samples import Samples, sample_recording
+from calibration.limits import LIMITS, judged, worst
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects
@@ -40,7 +42,7 @@ def evidence(**changes):
         "rotation_from_mean_deg": 0.05, "translation_from_mean_mm": 0.4,
     }  # fmt: skip
     bad = {**pair, "accepted": False, "reason": "poor fit", "rotation_from_mean_deg": None}
-    return {
+    found = {
         "format": "tofcapture-evidence", "version": 1, "backend": "open3d", "views": 2, "used": 1,
         "T_tof_stereo": TRUE.tolist(), "initial_T_tof_stereo": (exp([0.01, 0, 0, 0, 0.02, 0]) @ TRUE).tolist(),
         "spread": {"rotation_deg": 0.1, "translation_mm": 0.5},
@@ -49,6 +51,7 @@ def evidence(**changes):
         "pairs": [{**pair, "view": "views/calibration/view-000.h5"}, {**bad, "view": "views/calibration/view-001.h5"}],
         "truth": None, **changes,
     }  # fmt: skip
+    return {**found, "checks": [asdict(c) for c in judged_evidence(found)]}
 
 
 def samples(n=4000, bias=0.0):
@@ -163,15 +166,17 @@ def test_new_keys_are_shown():
     words = [c.words for _, _, _, rows in content["sections"] for c in rows]
     assert LIMITS["uncertain_motion"].words in words
     assert LIMITS["wiggle"].words in words
-    assert least_certain(C) == pytest.approx(1e-4)
+    least = next(c for c in found["checks"] if c["words"] == LIMITS["uncertain_motion"].words)
+    assert least["value"] == "0.1 mm"
 
 
-@pytest.mark.parametrize("covariance", [{"matrix": np.eye(6).tolist()}, "none", [[1.0]], {"other": 3}])
-def test_covariance_in_any_form_is_tolerated(covariance):
-    """A covariance in a table is found; anything else counts as absent."""
-    C, words = uncertainty(evidence(covariance=covariance))
-    assert (words == "its covariance") == (isinstance(covariance, dict) and "matrix" in covariance)
-    assert C.shape == (6, 6)
+def test_without_a_covariance_the_standard_errors_stand_for_it():
+    """Each is spread evenly over three axes."""
+    C, words = uncertainty(evidence())
+    assert "standard errors" in words
+    assert np.sqrt(np.trace(C[:3, :3])) == pytest.approx(0.15e-3)
+    assert np.degrees(np.sqrt(np.trace(C[3:, 3:]))) == pytest.approx(0.03)
+    assert uncertainty(evidence(covariance=np.eye(6).tolist()))[1] == "its covariance"
 
 
 def test_a_range_bias_is_judged_and_explained():
@@ -188,11 +193,11 @@ def test_a_range_bias_is_judged_and_explained():
 
 def test_limits_judge_both_ways():
     """PASS, WARN and FAIL on either side, upwards and downwards; what is missing fails."""
-    assert [check("rmse", v).verdict for v in (4.0, 4.5, 6.0, None, float("nan"))] == [
+    assert [judged("rmse", v).verdict for v in (4.0, 4.5, 6.0, None, float("nan"))] == [
         "PASS", "WARN", "FAIL", "FAIL", "FAIL",
     ]  # fmt: skip
-    assert [check("used", v).verdict for v in (8, 5, 2)] == ["PASS", "WARN", "FAIL"]
-    assert worst([check("used", 8), check("used", 5)]) == "WARN"
+    assert [judged("used", v).verdict for v in (8, 5, 2)] == ["PASS", "WARN", "FAIL"]
+    assert worst(["PASS", "WARN"]) == "WARN"
     assert all(limit.cause for limit in LIMITS.values())
 
 

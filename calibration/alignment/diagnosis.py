@@ -1,4 +1,4 @@
-"""Why an alignment failed: wrong units, a swapped transform, mirrored axes, blind cameras, views that do not belong together.
+"""Say why an alignment failed: wrong units, a swapped transform, mirrored axes, blind cameras, views that do not belong together.
 
 Asked only after a failure, so it may read views again and try registrations that nobody would start with.
 """
@@ -6,43 +6,39 @@ Asked only after a failure, so it may read views again and try registrations tha
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from calibration.alignment.rounds import RefusedPairsError
+from calibration.registration.backends import register
 from calibration.registration.clouds import WORKING_DEPTH, Cloud
-from calibration.registration.gate import Refusal, Registration, check_registration
+from calibration.registration.gate import Refusal, check_registration
 from calibration.registration.pairs import Pair
 from tofcapture.errors import ConfigError, DataError, QualityError, TofError
+from tofcapture.files.view import read_view
 from tofcapture.frames import View
+from tofcapture.pool import Pool
 from tofcapture.poses import Float64, invert
-
-Register = Callable[[Pair, Float64], Registration]
 
 APART = 1.0  # m between two cameras on one bracket; a rig in millimetres is far beyond
 MILLIMETRES = 50.0  # m; no calibration board stands there
 TRIED = 3  # pairs that a suspicion is tried on
-MIRRORS = {"x": (-1.0, 1.0, 1.0), "y": (1.0, -1.0, 1.0)}
+MIRRORS = {"x": (-1, 1, 1), "y": (1, -1, 1)}
+_MIXED = "ToF and stereo images come from different views or different boards, or the board moved"
 CAUSES = {
     Refusal.EMPTY: "no board between 0.2 and 1.8 m in the views: too far, dark, saturated, or hidden",
     Refusal.NO_OVERLAP: "the cameras did not look at the same board at the same time, or the initial guess is far off",
     Refusal.PLANAR: "no rims in sight: use a board with cut-outs, 4 cm or more in front of what is behind it",
     Refusal.DIVERGED: "the initial guess is far off, or ToF and stereo images come from different views or different boards",
-    Refusal.NOT_CONVERGED: "ToF and stereo images come from different views or different boards, or the board moved",
-    Refusal.POOR_FIT: "ToF and stereo images come from different views or different boards, or the board moved",
+    Refusal.NOT_CONVERGED: _MIXED,
+    Refusal.POOR_FIT: _MIXED,
 }
 
 
 def check_start(T_tof_stereo: Float64) -> None:
-    """Refuse an initial guess that no rig can have.
-
-    Raises
-    ------
-    ConfigError
-        Not finite, or cameras farther apart than a metre.
-    """
+    """Refuse an initial guess that no rig can have: not finite, or cameras farther apart than a metre (:class:`ConfigError`)."""
     apart = float(np.linalg.norm(T_tof_stereo[:3, 3]))
     if np.isfinite(T_tof_stereo).all() and apart < APART:
         return
@@ -53,12 +49,7 @@ def check_start(T_tof_stereo: Float64) -> None:
 
 
 def explained(
-    error: QualityError,
-    recording: Path,
-    pairs: Sequence[Pair],
-    refusals: Sequence[Refusal | None],
-    guess: Float64,
-    register: Register,
+    error: RefusedPairsError, recording: Path, pairs: Sequence[Pair], backend: str, T_tof_stereo: Float64
 ) -> TofError:
     """Find the likely cause of a failed alignment.
 
@@ -66,37 +57,45 @@ def explained(
     ----------
     error
         What was raised.
-    recording, pairs, refusals
-        What was aligned, and why which pair was refused.
-    guess
-        (4, 4) ``T_stereo_tof`` that it started from.
-    register
-        Registers a pair from a start.
+    recording, pairs, backend
+        What was aligned, and how.
+    T_tof_stereo
+        (4, 4) that it started from.
 
     Returns
     -------
     TofError
         :class:`DataError` or :class:`ConfigError` where one cause is certain, else ``error`` with its likely cause.
     """
-    from tofcapture.files.view import read_view
-
-    failed = [p for p, refusal in zip(pairs, refusals, strict=True) if refusal is not None]
+    failed = [p for p, refusal in zip(pairs, error.refusals, strict=True) if refusal is not None]
     for pair in failed[:TRIED]:
         if (found := unusable(read_view(recording / pair.name), pair.name)) is not None:
             return found
     full = [p for p in failed if len(p.source) and len(p.target)][:TRIED]
-    if full and _fits(full, invert(guess), register):
-        return ConfigError(
-            f"{error.message}; from the inverse of the initial transform the views fit",
-            hint="the initial transform is swapped: T_tof_stereo maps stereo points into the ToF frame",
-        )
-    for axis, signs in MIRRORS.items():
-        if full and _fits([_mirrored(p, np.array(signs)) for p in full], guess, register):
-            return DataError(
-                f"{error.message}; with {axis} of the stereo points turned round the views fit",
-                hint=f"the stereo driver's {axis} axis is mirrored: expected x right, y down, z forward",
+    with Pool(1, pinned=True) as pool:
+
+        def fits(signs: Sequence[int], start: Float64) -> bool:
+            """Tell whether most pairs, their stereo points mirrored by ``signs``, pass the gate from another start."""
+            good = 0
+            for p in full:
+                mirror = np.array(signs)
+                target = Cloud(p.target.points * mirror, p.target.normals * mirror)
+                result = pool.call(register, backend, p.source, target, start)
+                good += check_registration(result, p.source, target, start) is None
+            return 2 * good > len(full)
+
+        if fits((1, 1, 1), T_tof_stereo):
+            return ConfigError(
+                f"{error.message}; from the inverse of the initial transform the views fit",
+                hint="the initial transform is swapped: T_tof_stereo maps stereo points into the ToF frame",
             )
-    common = Counter(r for r in refusals if r is not None).most_common(1)
+        for axis, signs in MIRRORS.items():
+            if fits(signs, invert(T_tof_stereo)):
+                return DataError(
+                    f"{error.message}; with {axis} of the stereo points turned round the views fit",
+                    hint=f"the stereo driver's {axis} axis is mirrored: expected x right, y down, z forward",
+                )
+    common = Counter(r for r in error.refusals if r is not None).most_common(1)
     return QualityError(error.message, hint=f"likely cause: {CAUSES[common[0][0]]}") if common else error
 
 
@@ -132,13 +131,3 @@ def unusable(view: View, name: str) -> DataError | None:
             hint="move the board nearer, or check the unit of the stereo points",
         )
     return None
-
-
-def _mirrored(pair: Pair, signs: Float64) -> Pair:
-    return replace(pair, target=Cloud(pair.target.points * signs, pair.target.normals * signs))
-
-
-def _fits(pairs: Sequence[Pair], start: Float64, register: Register) -> bool:
-    """Tell whether most pairs pass the gate from another start."""
-    good = [check_registration(register(p, start), p.source, p.target, start) is None for p in pairs]
-    return 2 * sum(good) > len(good)

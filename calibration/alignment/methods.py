@@ -1,55 +1,43 @@
-"""What ``align`` makes of its accepted pairs: the plain average, the information-weighted fusion, or the joint solution."""
+"""Make a rig of the accepted pairs: by the plain average, the information-weighted fusion, or the joint solution.
+
+The last two say how sure they are: one sigma of every motion, which motions the views hold, and which tilt would help most next.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from calibration.alignment.fusion import about, fuse, jackknife, twist_about
-from calibration.alignment.joint_icp import JointSolution, joint_icp
-from calibration.alignment.joint_views import JointView, joint_view_of
-from calibration.alignment.observability import observability, suggest_view
-from calibration.evidence.evidence import alignment_error
-from calibration.range_error.error import ORDERS, TERMS, composed
+from calibration.alignment.averages import about, fuse, twist_about
+from calibration.alignment.joint import JointSolution, joint_icp
+from calibration.alignment.rounds import Solution
+from calibration.alignment.views import TERMS, joint_view_of
+from calibration.range_error.error import Terms, jackknife
 from calibration.registration.pairs import Pair
 from tofcapture.errors import ConfigError
-from tofcapture.poses import Float64, invert
+from tofcapture.files.view import read_view
+from tofcapture.poses import Float64, invert, rotation_angle, transform_points
 from tofcapture.rig import RangeError, Rig
 
-if TYPE_CHECKING:
-    from calibration.align import Solution
-
 METHODS = ("averaged", "weighted", "joint")
+TRUTH_POINT = (0.0, 0.0, 0.8)  # m, ToF frame: the middle of the working volume, where errors are stated
 
-
-@dataclass(frozen=True)
-class Aligned:
-    """Result of one method.
-
-    Attributes
-    ----------
-    rig
-        The start rig with the new ``T_tof_stereo``; the joint method adds its range errors.
-    evidence
-        What ``evidence.json`` gains.
-    """
-
-    rig: Rig
-    evidence: dict[str, Any]
+MOTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
+RADIUS = 0.2  # m, half a board: a rotation counts by how far it moves a board's edge
+WEAK_SIGMA = 0.002  # m; a motion known no better than this is not held at all by a board's views
+TILTS_DEG = (20.0, 30.0, 40.0)
+TURNS = 12
+POINTS = 200  # that a suggested view is judged by
+POINT_SIGMA = 0.011  # m, as if independent: 2 mm times the root of the neighbours that share its bias
 
 
 def method_named(name: str) -> str:
-    """Check a method's name.
-
-    Raises
-    ------
-    ConfigError
-        Unknown name.
-    """
+    """Check a method's name; :class:`ConfigError` names those there are."""
     if name not in METHODS:
         raise ConfigError(f"method: expected one of {', '.join(METHODS)}, got {name!r}")
     return name
@@ -57,7 +45,7 @@ def method_named(name: str) -> str:
 
 def apply_method(
     method: str, recording: Path, pairs: Sequence[Pair], solution: Solution, start: Rig
-) -> Aligned:
+) -> tuple[Rig, dict[str, Any]]:
     """Turn gated registrations into a rig.
 
     Parameters
@@ -70,88 +58,190 @@ def apply_method(
         What was registered, and the averaged solution.
     start
         Rig that the result keeps everything else of.
+
+    Returns
+    -------
+    rig
+        The start rig with the new ``T_tof_stereo``; the joint method adds its range errors.
+    evidence
+        What ``evidence.json`` gains.
     """
-    averaged = invert(solution.average.T)
-    weighted = _weighted(solution)
-    found = {"averaged": averaged, "weighted": weighted}
+    averaged, weighted = invert(solution.average.T), _weighted(solution, solution.used)
+    found, rig = {"averaged": averaged, "weighted": weighted}, start
     extra: dict[str, Any] = {}
-    rig = start
     if method == "weighted":
-        influence, covariance = _left_out(solution, weighted)
-        extra = {"covariance": covariance.tolist(), **stated_uncertainty(influence, covariance)}
+        extra = _uncertainty(*_left_out(solution, weighted))
     if method == "joint":
-        views = [_read(recording, pairs[i]) for i in solution.used]
+        views = [joint_view_of(read_view(recording / pairs[i].name)) for i in solution.used]
         joint = joint_icp(views, averaged)
         found["joint"] = joint.T_tof_stereo
-        hz = views[0].modulation_hz
-        errors = composed(views[0].factory, hz, joint.range_coefficients)
+        errors = composed(views[0].factory, views[0].modulation_hz, joint.range_coefficients)
         rig = replace(start, range_errors=errors)
-        extra = joint_evidence(joint, hz, errors)
-    true = pairs[0].truth
-    return Aligned(
-        replace(rig, T_tof_stereo=found[method]),
-        {"method": method, "methods": {k: _stated(T, true) for k, T in found.items()}, **extra},
+        extra = joint_evidence(joint, errors)
+    methods = {name: _stated(T, pairs[0].truth) for name, T in found.items()}
+    rig = replace(rig, T_tof_stereo=found[method])
+    return rig, {"method": method, "methods": methods, **extra}
+
+
+def alignment_error(T_tof_stereo: Float64, true: Float64) -> tuple[float, float]:
+    """Compare an alignment (4, 4) with the true one.
+
+    Returns
+    -------
+    rotation
+        Radians.
+    translation
+        Metres, how far a point 0.8 m in front of the ToF camera lands from where it should.
+    """
+    moved = T_tof_stereo @ invert(true)
+    shift = transform_points(moved, np.array(TRUTH_POINT)) - TRUTH_POINT
+    return rotation_angle(moved), float(np.linalg.norm(shift))
+
+
+def composed(
+    factory: Sequence[RangeError], modulation_hz: Sequence[float], coefficients: Float64
+) -> tuple[RangeError, ...]:
+    """Add fitted range errors to the factory's, one per frequency.
+
+    Parameters
+    ----------
+    factory
+        What was taken off before the fit; may lack frequencies.
+    modulation_hz
+        (F,) ascending.
+    coefficients
+        (U,) of :meth:`JointView.terms`; shares of scattered light have no place in a :class:`RangeError` and are left out.
+    """
+    known = {e.modulation_hz: e for e in factory}
+    own = coefficients[: len(modulation_hz) * TERMS].reshape(-1, TERMS)
+    return tuple(
+        Terms(hz).added(known.get(hz, RangeError(hz)), x) for hz, x in zip(modulation_hz, own, strict=True)
     )
 
 
-def joint_evidence(
-    joint: JointSolution, modulation_hz: Sequence[float], errors: Sequence[RangeError]
-) -> dict[str, Any]:
-    """Covariance, observability, suggestion and range errors of a joint solution as JSON types."""
+def joint_evidence(joint: JointSolution, errors: Sequence[RangeError]) -> dict[str, Any]:
+    """State covariance, observability, suggestion and range errors of a joint solution as JSON types."""
     # What is believed is the covariance; the model's own information knows nothing of bias.
     information = np.asarray(np.linalg.inv(joint.covariance), dtype=np.float64)
-    seen = observability(information)
-    own = joint.range_coefficients
+    values, _ = observability(information)
+    own = composed((), [e.modulation_hz for e in errors], joint.range_coefficients)
     return {
         "working_point_m": joint.centre.tolist(),
-        "covariance": joint.covariance.tolist(),
-        **stated_uncertainty(joint.influence, joint.covariance),
+        **_uncertainty(joint.influence, joint.covariance),
         "observability": {
-            "eigenvalues": seen.eigenvalues.tolist(),
-            "sigma_mm": seen.sigma_mm.tolist(),
-            "unconstrained": list(seen.unconstrained),
+            "eigenvalues": values.tolist(),
+            "sigma_mm": _sigma_mm(values).tolist(),
+            "unconstrained": unconstrained(information),
             "suggestion": suggest_view(information, joint.centre),
         },
         "range_errors": [
             {
-                "modulation_hz": hz,
-                "offset": float(own[i * TERMS]),
-                "per_pixel_radius": float(own[i * TERMS + 1]),
-                "harmonics": [
-                    [m, *own[i * TERMS + 2 + 2 * k : i * TERMS + 4 + 2 * k].tolist()]
-                    for k, m in enumerate(ORDERS)
-                ],
-                "with_factory_offset": errors[i].offset,
+                "modulation_hz": x.modulation_hz,
+                "offset": x.offset,
+                "per_pixel_radius": x.per_pixel_radius,
+                "harmonics": [list(wave) for wave in x.harmonics],
+                "with_factory_offset": error.offset,
             }
-            for i, hz in enumerate(modulation_hz)
+            for x, error in zip(own, errors, strict=True)
         ],
     }
 
 
-def stated_uncertainty(influence: Float64, covariance: Float64) -> dict[str, Any]:
-    """What a method's own covariance says, as JSON types.
+def observability(information: Float64) -> tuple[Float64, Float64]:
+    """Take an information (6, 6) of the twist (rho, phi) about the working point, ToF axes, apart.
 
-    Parameters
-    ----------
-    influence
-        (N, 6) of :func:`calibration.alignment.fusion.jackknife`.
-    covariance
-        (6, 6) of the twist about the working point, ToF axes.
+    Returns
+    -------
+    eigenvalues
+        (6,) ascending, 1/m^2, rotations measured as motion at ``RADIUS``.
+    motions
+        (6, 6) rows: their unit motions, (x, y, z, then rotations times ``RADIUS``).
+    """
+    scale = np.repeat([1.0, 1 / RADIUS], 3)
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    return np.maximum(values, 0), vectors.T
+
+
+def unconstrained(information: Float64) -> list[str]:
+    """Name the motions that are not held, known to no better than 2 mm."""
+    values, motions = observability(information)
+    return [motion_name(v) for v in motions[values < 1 / WEAK_SIGMA**2]]
+
+
+def motion_name(motion: Float64) -> str:
+    """Name a unit motion (6,) by its largest parts, largest first."""
+    order = np.argsort(-np.abs(motion))
+    parts = [f"{MOTIONS[i]} ({abs(motion[i]):.2f})" for i in order if abs(motion[i]) > 0.35]
+    return " with ".join(parts)
+
+
+def plane_information(normal: Float64, centre: Float64, working_point: Float64) -> Float64:
+    """Compute the information (6, 6) of a board without rims, seen at ``centre`` (3,) with ``normal`` (3,), ToF frame, metres."""
+    a = np.cross(normal, [0.0, 1.0, 0.0])
+    a /= np.linalg.norm(a)
+    b = np.cross(normal, a)
+    side = np.linspace(-RADIUS, RADIUS, 9)
+    points = centre + (side[:, None, None] * a + side[None, :, None] * b).reshape(-1, 3)
+    J = np.concatenate([np.tile(normal, (len(points), 1)), np.cross(points - working_point, normal)], axis=1)
+    out: Float64 = J.T @ J * POINTS / len(points) / POINT_SIGMA**2
+    return out
+
+
+def suggest_view(information: Float64, working_point: Float64) -> dict[str, Any]:
+    """Name the tilt of the board that lowers the largest uncertainty most.
+
+    Every candidate adds the information of a tilted plane at the working point. The best has the smallest largest eigenvalue of
+    the covariance, and among equals the smallest trace.
 
     Returns
     -------
     dict
-        ``spread`` of single views, ``standard_error``, ``sigma`` of each component, and the same ``in_words``.
+        ``tilt_deg``, ``towards_deg`` (direction in the image in which the board's normal leans, 0 right, 90 down),
+        ``motion`` that is weakest now, ``sigma_mm`` of it before and ``expected_sigma_mm`` after.
     """
-    sigma = np.sqrt(np.diag(covariance))
+
+    def after(tilt_deg: float, towards_deg: float) -> Float64:
+        t, d = np.radians(tilt_deg), np.radians(towards_deg)
+        normal = np.array([np.sin(t) * np.cos(d), np.sin(t) * np.sin(d), -np.cos(t)])
+        added = plane_information(normal, working_point, working_point)
+        return np.maximum(observability(information + added)[0], 1e-6)
+
+    def cost(tilt: tuple[float, float]) -> tuple[float, float]:
+        values = after(*tilt)
+        return round(float(1 / values[0]), 12), float((1 / values).sum())
+
+    best = min(product(TILTS_DEG, (360.0 * k / TURNS for k in range(TURNS))), key=cost)
+    values, motions = observability(information)
     return {
+        "tilt_deg": best[0],
+        "towards_deg": best[1],
+        "motion": motion_name(motions[0]),
+        "sigma_mm": float(_sigma_mm(values)[0]),
+        "expected_sigma_mm": float(_sigma_mm(after(*best))[0]),
+    }
+
+
+def _sigma_mm(eigenvalues: Float64) -> Float64:
+    return np.asarray(1e3 / np.sqrt(np.maximum(eigenvalues, 1e-12)))
+
+
+def _uncertainty(influence: Float64, covariance: Float64) -> dict[str, Any]:
+    """Covariance (6, 6) about the working point and what it means, as JSON types; ``influence`` as of :func:`jackknife`."""
+    sigma = np.sqrt(np.diag(covariance))
+    moved = ", ".join(f"{1e3 * s:.2f} mm along {a}" for a, s in zip("xyz", sigma[:3], strict=True))
+    turned = ", ".join(f"{np.degrees(s):.3f} deg about {a}" for a, s in zip("xyz", sigma[3:], strict=True))
+    return {
+        "covariance": covariance.tolist(),
         "spread": _lengths(np.square(influence).sum(axis=0) / (len(influence) - 1)),
         "standard_error": _lengths(np.square(sigma)),
         "sigma": {
             "translation_mm": (1e3 * sigma[:3]).tolist(),
             "rotation_deg": np.degrees(sigma[3:]).tolist(),
         },
-        "in_words": _in_words(sigma),
+        "in_words": (
+            f"The stereo camera's place in the ToF camera's axes is believed to {moved}, and to {turned} (one sigma: two times "
+            "in three the error is smaller), as seen at the working point."
+        ),
     }
 
 
@@ -160,36 +250,18 @@ def _lengths(variances: Float64) -> dict[str, float]:
     return {"rotation_deg": float(np.degrees(turned)), "translation_mm": float(1e3 * moved)}
 
 
-def _in_words(sigma: Float64) -> str:
-    moved = ", ".join(f"{1e3 * s:.2f} mm along {a}" for a, s in zip("xyz", sigma[:3], strict=True))
-    turned = ", ".join(f"{np.degrees(s):.3f} deg about {a}" for a, s in zip("xyz", sigma[3:], strict=True))
-    return (
-        f"The stereo camera's place in the ToF camera's axes is believed to {moved}, and to {turned} (one sigma: two times in "
-        "three the error is smaller), as seen at the working point."
-    )
-
-
 def _left_out(solution: Solution, fused: Float64) -> tuple[Float64, Float64]:
     """Influence and covariance of the weighted fusion from leaving out each pair in turn."""
-    used = solution.used
-    back = invert(fused)
-    twists = [
-        twist_about(_weighted(solution, [i for i in used if i != out]) @ back, solution.working_point)
-        for out in used
-    ]
-    return jackknife(np.stack(twists))
+    used, back = solution.used, invert(fused)
+    without = [_weighted(solution, [i for i in used if i != out]) for out in used]
+    return jackknife(np.stack([twist_about(T @ back, solution.working_point) for T in without]))
 
 
-def _weighted(solution: Solution, used: Sequence[int] | None = None) -> Float64:
-    chosen = [solution.registrations[i] for i in (solution.used if used is None else used)]
+def _weighted(solution: Solution, used: Sequence[int]) -> Float64:
+    chosen = [solution.registrations[i] for i in used]
+    # A registration's information is of a motion in target axes, on the left of the transform; that of its inverse is on the right.
     informations = [about(r.information, r.centre) for r in chosen]
-    return fuse([invert(r.T_target_source) for r in chosen], informations).T
-
-
-def _read(recording: Path, pair: Pair) -> JointView:
-    from tofcapture.files.view import read_view
-
-    return joint_view_of(read_view(recording / pair.name), pair.name)
+    return fuse([invert(r.T_target_source) for r in chosen], informations)
 
 
 def _stated(T_tof_stereo: Float64, true: Float64 | None) -> dict[str, Any]:

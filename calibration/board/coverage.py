@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calibration.board.geometry import inside
-from calibration.evidence.limits import LIMITS
+from calibration.board.geometry import inside, load_board
+from calibration.limits import LIMITS
+from calibration.registration.pairs import calibration_views
 from tofcapture.camera import Camera
 from tofcapture.command import Outcome
+from tofcapture.devices.clearance import stage_of
 from tofcapture.errors import DataError
+from tofcapture.files.view import read_view
 from tofcapture.poses import Float64, invert, transform, transform_points
 from tofcapture.record.board_meter import CELLS, SECTORS, TILTED, TILTS
 
@@ -33,26 +37,25 @@ def coverage(poses: Sequence[Float64], camera: Camera, outline: Float64) -> dict
     Returns
     -------
     dict
-        JSON types: ``views``; ``tilt_deg`` and ``distance_m`` of each view; ``tilt_histogram`` (counts between ``tilt_edges_deg``);
-        ``sectors`` (counts by the direction in which the front leans in the image); ``image`` (9 x 12 counts), ``image_share``;
-        ``missing`` (what to record next, in words; empty when nothing is).
+        JSON types: ``views``; ``tilt_deg``, ``lean_deg`` and ``distance_m`` of each view; ``tilt_histogram`` (counts between
+        ``tilt_edges_deg``); ``sectors`` (counts by the direction in which the front leans in the image); ``image`` (9 x 12 counts),
+        ``image_share``; ``missing`` (what to record next, in words; empty when nothing is).
     """
-    tilts, leans, distances, grid = [], [], [], np.zeros(CELLS, dtype=int)
+    tilts, leans, grid = [], [], np.zeros(CELLS, dtype=int)
+    sectors = dict.fromkeys(SECTORS, 0)
     outlines = np.broadcast_to(outline, (len(poses), *np.shape(outline)[-2:]))
     for T, shape in zip(poses, outlines, strict=True):
         tilt, lean = _tilt(T)
         tilts.append(tilt)
-        distances.append(float(np.linalg.norm(T[:3, 3])))
-        leans += [lean] if tilt >= TILTED else []
+        leans.append(lean)
+        if tilt >= TILTED:
+            sectors[SECTORS[round(lean / 45.0) % 8]] += 1
         grid += _seen(T, camera, shape)
-    sectors = dict.fromkeys(SECTORS, 0)
-    for lean in leans:
-        sectors[SECTORS[round(lean / 45.0) % 8]] += 1
     out: dict[str, Any] = {
         "views": len(tilts),
         "tilt_deg": tilts,
-        "lean_deg": [_tilt(T)[1] for T in poses],
-        "distance_m": distances,
+        "lean_deg": leans,
+        "distance_m": [float(np.linalg.norm(T[:3, 3])) for T in poses],
         "tilt_edges_deg": list(TILTS),
         "tilt_histogram": np.histogram(tilts, TILTS)[0].tolist(),
         "sectors": sectors,
@@ -72,7 +75,7 @@ def _tilt(T_tof_board: Float64) -> tuple[float, float]:
 
 
 def _seen(T_tof_board: Float64, camera: Camera, outline: Float64) -> Any:
-    """Return which cells of the image (9, 12) have their centre on the board, as 0 and 1."""
+    """Which cells of the image (9, 12) have their centre on the board, as 0 and 1."""
     corners = np.column_stack([outline, np.zeros(len(outline))])
     pixels, depth = camera.project(transform_points(T_tof_board, corners))
     if not (depth > 0).all():
@@ -94,27 +97,23 @@ def _missing(found: dict[str, Any], grid: Any) -> list[str]:
     if len(SECTORS) - len(empty) < LIMITS["sectors"].good:
         out.append(f"a board that faces {', '.join(empty)} in the image")
     if found["image_share"] < LIMITS["image"].good:
-        out.append(f"the board in the image's {_emptiest(grid)}")
+        rows, columns = CELLS[0] // 2, CELLS[1] // 2
+        quarters = {
+            "upper left": grid[:rows, :columns],
+            "upper right": grid[:rows, -columns:],
+            "lower left": grid[-rows:, :columns],
+            "lower right": grid[-rows:, -columns:],
+        }
+        emptiest = min(quarters, key=lambda name: float((quarters[name] > 0).mean()))
+        out.append(f"the board in the image's {emptiest}")
     near, far = min(found["distance_m"]), max(found["distance_m"])
     if far / near < LIMITS["distances"].good:
         out.append(f"other distances: all views are {near:.2f} to {far:.2f} m away")
     return out
 
 
-def _emptiest(grid: Any) -> str:
-    """Name the quarter of the image that the board has covered least."""
-    rows, columns = CELLS[0] // 2, CELLS[1] // 2
-    quarters = {
-        "upper left": grid[:rows, :columns],
-        "upper right": grid[:rows, columns:],
-        "lower left": grid[-rows:, :columns],
-        "lower right": grid[-rows:, columns:],
-    }
-    return min(quarters, key=lambda name: float((quarters[name] > 0).mean()))
-
-
 def recorded_poses(recording: Path) -> tuple[list[Float64], Camera]:
-    """Poses ``T_tof_board`` of a recording's calibration views, from the arm and the station's ``[plan]``; nothing is decoded.
+    """Read poses ``T_tof_board`` of a recording's calibration views off the arm and the station's ``[plan]``; nothing is decoded.
 
     The turn of the board in its plane is taken as that of the horizontal: it does not matter for a tilt, and little for the image.
 
@@ -123,46 +122,26 @@ def recorded_poses(recording: Path) -> tuple[list[Float64], Camera]:
     DataError
         No views, or a recording without a station.
     """
-    from calibration.registration.pairs import calibration_views
-    from tofcapture.devices.clearance import stage_of
-    from tofcapture.files.view import read_view
-
-    stage = stage_of(_station(recording))
-    T_base_board = _facing(stage.board, stage.board_normal)
-    poses, camera = [], None
-    for path in calibration_views(recording):
-        view = read_view(path)
-        camera = view.tof.info.camera
-        poses.append(invert(view.arm_before.T_base_flange @ view.rig.T_flange_tof) @ T_base_board)
-    if camera is None:
-        raise DataError(f"{recording}: no calibration views")
-    return poses, camera
-
-
-def _station(recording: Path) -> dict[str, Any]:
-    import tomllib
-
     path = Path(recording) / "station.toml"
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        stage = stage_of(tomllib.loads(path.read_text(encoding="utf-8")))
     except (OSError, tomllib.TOMLDecodeError) as err:
         raise DataError(
             f"{path}: cannot read where the board stands: {err}", hint="record writes it beside the views"
         ) from err
-
-
-def _facing(centre: Float64, normal: Float64) -> Float64:
-    """Pose of a board at ``centre`` whose z is ``normal`` and whose y lies level."""
-    z = normal / np.linalg.norm(normal)
+    z = stage.board_normal / np.linalg.norm(stage.board_normal)
     y = np.cross(z, [1.0, 0.0, 0.0])
     y = y / np.linalg.norm(y) if np.linalg.norm(y) > 1e-6 else np.array([0.0, 1.0, 0.0])
-    return transform(np.stack([np.cross(y, z), y, z], axis=1), centre)
+    T_base_board = transform(np.stack([np.cross(y, z), y, z], axis=1), stage.board)
+    poses = []
+    for view in map(read_view, calibration_views(recording)):
+        poses.append(invert(view.arm_before.T_base_flange @ view.rig.T_flange_tof) @ T_base_board)
+        camera = view.tof.info.camera
+    return poses, camera
 
 
 def run_coverage(args: argparse.Namespace) -> Outcome:
     """Print what the calibration views of a recording cover, and what is missing."""
-    from calibration.board.geometry import load_board
-
     poses, camera = recorded_poses(args.recording)
     found = coverage(poses, camera, load_board(args.board).outline)
     return Outcome(found, meter(found))
@@ -171,18 +150,15 @@ def run_coverage(args: argparse.Namespace) -> Outcome:
 def meter(found: dict[str, Any]) -> str:
     """Lay a coverage out for a person, in a few lines."""
     edges = found["tilt_edges_deg"]
-    tilts = "  ".join(
-        f"{low:g}-{high:g} deg {n}"
-        for low, high, n in zip(edges, edges[1:], found["tilt_histogram"], strict=False)
-    )
+    tilts = zip(edges, edges[1:], found["tilt_histogram"], strict=False)
     marks = " .:+*#"
-    image = ["  " + "".join(marks[min(n, len(marks) - 1)] * 2 for n in row) for row in found["image"]]
     lines = [
         f"{found['views']} views",
-        f"tilts      {tilts}",
+        f"tilts      {'  '.join(f'{low:g}-{high:g} deg {n}' for low, high, n in tilts)}",
         f"faces      {'  '.join(f'{name} {n}' for name, n in found['sectors'].items())}",
     ]
     if found["distance_m"]:
         lines.append(f"distance   {min(found['distance_m']):.2f} to {max(found['distance_m']):.2f} m")
-    lines += [f"image      {100 * found['image_share']:.0f} % covered", *image]
+    lines.append(f"image      {100 * found['image_share']:.0f} % covered")
+    lines += ["  " + "".join(marks[min(n, len(marks) - 1)] * 2 for n in row) for row in found["image"]]
     return "\n".join([*lines, f"missing    {'; '.join(found['missing']) or 'nothing'}"])

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError
-from tofcapture.meshes import Mesh, circle, extrude, signed_area
+from tofcapture.meshes import circle, signed_area
 from tofcapture.poses import Float64
 
 BOARDS = Path(__file__).with_name("boards")
@@ -30,62 +30,38 @@ SAME = 0.0015  # m; symmetric to less than this looks symmetric to a camera
 
 @dataclass(frozen=True)
 class Hole:
-    """One cut-out.
+    """One cut-out."""
 
-    Attributes
-    ----------
-    name
-        As in the file.
-    corners
-        (M, 2) float64 simple polygon, metres, counter-clockwise; of a circle, its facets.
-    centre, radius
-        Of a circle, metres; None and 0 for a polygon.
-    """
-
-    name: str
-    corners: Float64
+    name: str  #: As in the file
+    corners: Float64  #: (M, 2) float64 simple polygon, metres, counter-clockwise; of a circle, its facets
+    #: Of a circle, metres; None and 0 for a polygon
     centre: tuple[float, float] | None = None
     radius: float = 0.0
 
 
 @dataclass(frozen=True)
 class Board:
-    """A flat plate with cut-outs.
+    """A flat plate with cut-outs."""
 
-    Attributes
-    ----------
-    name
-        As in the file.
-    outline
-        (N, 2) float64 simple polygon, metres, counter-clockwise.
-    thickness
-        Metres.
-    holes
-        In the order of the file.
-    """
-
-    name: str
-    outline: Float64
-    thickness: float
-    holes: tuple[Hole, ...]
+    name: str  #: As in the file
+    outline: Float64  #: (N, 2) float64 simple polygon, metres, counter-clockwise
+    thickness: float  #: Metres
+    holes: tuple[Hole, ...]  #: In the order of the file
 
     @property
     def rings(self) -> list[Float64]:
         """Outline, then the corners of every hole."""
         return [self.outline, *(hole.corners for hole in self.holes)]
 
-    def mesh(self) -> Mesh:
-        """Closed mesh (vertices, triangles) from z = 0 to the thickness, metres."""
-        return extrude(self.outline, self.thickness, [hole.corners for hole in self.holes])
+    @property
+    def middle(self) -> Float64:
+        """(2,) centre of the outline's bounding box."""
+        out: Float64 = (self.outline.max(axis=0) + self.outline.min(axis=0)) / 2
+        return out
 
 
 def load_board(board: str | Path = DEFAULT) -> Board:
-    """Read a board.
-
-    Parameters
-    ----------
-    board
-        Path of a TOML file, or the name of a packaged board: ``default``, ``second``.
+    """Read a board: a TOML file, or a packaged one by name (``default``, ``second``).
 
     Raises
     ------
@@ -123,21 +99,13 @@ def board_from(table: Mapping[str, Any], where: str = "board") -> Board:
         raise ConfigError(f'{where}: expected units = "m", got {table.get("units")!r}')
     holes = tuple(_hole(t, f"{where}: hole {i + 1}") for i, t in enumerate(table.get("hole", [])))
     outline = _polygon(table.get("outline"), f"{where}: outline")
-    board = Board(
-        str(table.get("name", where)), outline, _length(table, "thickness", f"{where}: thickness"), holes
-    )
-    check_board(board, where)
+    thickness = _length(table, "thickness", f"{where}: thickness")
+    board = Board(str(table.get("name", where)), outline, thickness, holes)
+    _check_cuttable(board, where)
     return board
 
 
-def check_board(board: Board, where: str = "board") -> None:
-    """Refuse a board that cannot be cut.
-
-    Raises
-    ------
-    ConfigError
-        With the hole's name.
-    """
+def _check_cuttable(board: Board, where: str) -> None:
     size = float(np.ptp(board.outline, axis=0).max())
     if not SIZES[0] <= size <= SIZES[1]:
         raise ConfigError(
@@ -155,11 +123,8 @@ def check_board(board: Board, where: str = "board") -> None:
                 f"{where}: hole {hole.name!r}: expected inside the outline, {MIN_WEB} m from it"
             )
     for a, b in combinations(board.holes, 2):
-        if (
-            inside(a.corners, b.corners).any()
-            or inside(b.corners, a.corners).any()
-            or _gap(a.corners, b.corners) < MIN_WEB
-        ):
+        nested = inside(a.corners, b.corners).any() or inside(b.corners, a.corners).any()
+        if nested or _gap(a.corners, b.corners) < MIN_WEB:
             raise ConfigError(
                 f"{where}: holes {a.name!r} and {b.name!r}: expected {MIN_WEB} m of material between them"
             )
@@ -177,7 +142,7 @@ def inside(polygon: Float64, points: Float64) -> NDArray[np.bool_]:
 
 
 def distance_to_ring(polygon: Float64, points: Float64) -> Float64:
-    """Distance (...,) of points (..., 2) to the border of a polygon (N, 2), metres."""
+    """Measure the distance (...,) of points (..., 2) to the border of a polygon (N, 2), metres."""
     side = np.roll(polygon, -1, axis=0) - polygon
     offset = points[..., None, :] - polygon
     t = np.clip((offset * side).sum(axis=-1) / np.square(side).sum(axis=-1), 0, 1)
@@ -185,31 +150,33 @@ def distance_to_ring(polygon: Float64, points: Float64) -> Float64:
     return out
 
 
+def sampled(ring: Float64, pitch: float = 0.004) -> tuple[Float64, Float64]:
+    """Sample a closed polygon (N, 2) about every ``pitch`` metres: points (M, 2), and unit directions (M, 2) to the right of its way."""
+    at, right = [], []
+    for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        side = b - a
+        length = float(np.linalg.norm(side))
+        n = max(1, round(length / pitch))
+        at.append(a + side * ((np.arange(n) + 0.5) / n)[:, None])
+        right.append(np.broadcast_to([side[1] / length, -side[0] / length], (n, 2)))
+    return np.concatenate(at), np.concatenate(right)
+
+
 def symmetries(board: Board) -> list[str]:
     """Name the turns in its plane that map a board onto itself to 1.5 mm: no camera can tell them apart."""
-    samples = np.concatenate([_sampled(ring) for ring in board.rings])
-    centre = (board.outline.max(axis=0) + board.outline.min(axis=0)) / 2
+    samples = np.concatenate([sampled(ring)[0] for ring in board.rings])
     found = []
     for degrees in (60, 72, 90, 120, 180):
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-        turned = (samples - centre) @ np.array([[c, s], [-s, c]]) + centre
+        turned = (samples - board.middle) @ np.array([[c, s], [-s, c]]) + board.middle
         off = np.min([distance_to_ring(ring, turned) for ring in board.rings], axis=0)
         if off.max() < SAME:
             found.append(f"turn by {degrees} deg")
     return found
 
 
-def _sampled(ring: Float64, pitch: float = 0.004) -> Float64:
-    """Points (M, 2) along a closed polygon, about ``pitch`` metres apart."""
-    parts = []
-    for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-        n = max(1, int(np.ceil(np.linalg.norm(b - a) / pitch)))
-        parts.append(a + (b - a) * ((np.arange(n) + 0.5) / n)[:, None])
-    return np.concatenate(parts)
-
-
 def _gap(a: Float64, b: Float64) -> float:
-    return float(min(distance_to_ring(a, _sampled(b)).min(), distance_to_ring(b, _sampled(a)).min()))
+    return float(min(distance_to_ring(a, sampled(b)[0]).min(), distance_to_ring(b, sampled(a)[0]).min()))
 
 
 def _known(table: Mapping[str, Any], keys: set[str], where: str) -> None:
@@ -234,12 +201,11 @@ def _hole(table: Mapping[str, Any], where: str) -> Hole:
         raise ConfigError(f"{where}: expected either corners, or centre and radius")
     if "corners" in table:
         return Hole(name, _polygon(table["corners"], where))
-    centre = _points([table["centre"]], where)[0]
+    x, y = _points([table["centre"]], where)[0].tolist()
     radius, segments = _length(table, "radius", where), table.get("segments", SEGMENTS)
     if not isinstance(segments, int) or not 8 <= segments <= 1024:
         raise ConfigError(f"{where}: segments: expected 8 to 1024, got {segments!r}")
-    at = (float(centre[0]), float(centre[1]))
-    return Hole(name, circle(radius, at, segments), at, radius)
+    return Hole(name, circle(radius, (x, y), segments), (x, y), radius)
 
 
 def _points(value: Any, where: str) -> Float64:
@@ -256,19 +222,9 @@ def _polygon(value: Any, where: str) -> Float64:
     points = _points(value, where)
     if len(points) < 3 or abs(signed_area(points)) < 1e-6:
         raise ConfigError(f"{where}: expected a polygon of at least 3 corners with an area")
-    if _crosses_itself(points):
+    side, away = np.roll(points, -1, axis=0) - points, points - points[:, None]
+    start, end = (side[:, None, 0] * w[..., 1] - side[:, None, 1] * w[..., 0] for w in (away, away + side))
+    apart = start * end < 0  # [i, j]: side j has its ends on either side of the line along side i
+    if (apart & apart.T).any():
         raise ConfigError(f"{where}: the polygon crosses itself", hint="list the corners in order")
     return points if signed_area(points) > 0 else points[::-1].copy()
-
-
-def _crosses_itself(ring: Float64) -> bool:
-    ends = np.roll(ring, -1, axis=0)
-
-    def side(a: Float64, b: Float64, p: Float64) -> float:
-        return float((b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]))
-
-    for i, j in combinations(range(len(ring)), 2):
-        a, b, c, d = ring[i], ends[i], ring[j], ends[j]
-        if side(a, b, c) * side(a, b, d) < 0 and side(c, d, a) * side(c, d, b) < 0:
-            return True
-    return False

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibration.evidence.limits import GOOD_ERROR_DEG, GOOD_ERROR_MM
 from tofcapture.command import Command, Outcome
 from tofcapture.errors import ConfigError
 
@@ -59,7 +58,8 @@ def _run(args: argparse.Namespace) -> Outcome:
         **summary,
         **{key: evidence[key] for key in ("method", "sigma", "in_words") if key in evidence},
         **(evidence["truth"] or {}),
-        "verdict": verdict(evidence),
+        "verdict": evidence["verdict"],
+        "checks": evidence["checks"],
         "values": rig_to_dict(rig),
         "page": page,
         "drift": None if moved is None else drift_table(moved),
@@ -82,14 +82,6 @@ def _page(
         return None, f"no evidence.html: {err.message}; {err.hint}"
 
 
-def verdict(evidence: dict[str, Any]) -> str:
-    """Say in a few words what the standard error of an alignment allows."""
-    error = evidence["standard_error"]
-    if error["rotation_deg"] <= GOOD_ERROR_DEG and error["translation_mm"] <= GOOD_ERROR_MM:
-        return "good"
-    return f"doubtful: expected at most {GOOD_ERROR_DEG} deg and {GOOD_ERROR_MM} mm; record more tilted board views"
-
-
 def table(evidence: dict[str, Any]) -> str:
     """Lay the evidence out for a person: one line per pair, then spread, truth and verdict."""
     lines = ["view      rmse mm  inliers  rotation deg  translation mm  from the mean"]
@@ -107,7 +99,11 @@ def table(evidence: dict[str, Any]) -> str:
     if truth := evidence["truth"]:
         error = f"{truth['rotation_error_deg']:.3f} deg  {truth['translation_error_mm']:.2f} mm"
         lines.append(f"{'true error':16}{error} at 0.8 m")
-    return "\n".join([*lines, f"verdict: {verdict(evidence)}"])
+    lines.append(f"verdict: {evidence['verdict']}")
+    for c in evidence["checks"]:
+        if c["verdict"] != "PASS":
+            lines.append(f"  {c['verdict']} {c['words']}: {c['value']} ({c['limits']}); likely: {c['cause']}")
+    return "\n".join(lines)
 
 
 def _row(pair: dict[str, Any]) -> str:

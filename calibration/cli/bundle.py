@@ -17,7 +17,7 @@ from tofcapture.poses import Float64, invert, rotation_log
 
 if TYPE_CHECKING:
     from calibration.board.geometry import Board
-    from calibration.bundle.solve import BoardFit, Bundle
+    from calibration.bundle import BoardFit, Bundle
     from tofcapture.frames import View
     from tofcapture.rig import Rig
 
@@ -40,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Detect the board in every view, solve the bundle, write ``T_flange_tof`` into ``rig.toml`` and ``bundle.json``."""
-    from calibration.bundle.solve import ARM_SIGMA, solve_bundle
+    from calibration.bundle import ARM_SIGMA, solve_bundle
     from tofcapture.files.seal import write_text
     from tofcapture.rig import dumps_rig
 
@@ -100,7 +100,7 @@ def board_fits(
 
 def _fits_of(view: View, index: int, board: Board) -> tuple[list[BoardFit], list[str]]:
     from calibration.board.detector import detect, stereo_sight, tof_sight
-    from calibration.bundle.solve import CAMERAS, BoardFit
+    from calibration.bundle import CAMERAS, BoardFit
 
     fits, refused = [], []
     for camera in CAMERAS:

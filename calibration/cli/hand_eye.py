@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibration.evidence.result_file import written
+from tofcapture.cli.kit import written
 from tofcapture.command import Outcome
 from tofcapture.errors import DataError, UsageError
 

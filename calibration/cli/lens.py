@@ -40,8 +40,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Fit the lens, write it into ``rig.toml`` and ``lens.json``."""
+    from calibration.board.fit import Model
     from calibration.board.geometry import load_board
-    from calibration.board.model import Model
     from calibration.lens.board import fit_lens_to_board
     from tofcapture.files.seal import write_text
     from tofcapture.rig import dumps_rig
@@ -112,8 +112,8 @@ def board_seen(view: View, rig: Rig, board: Board, name: str) -> BoardSeen:
 
 def report(fit: BoardLens, rig: Rig) -> dict[str, Any]:
     """Lay a fit out as JSON types."""
-    from calibration.evidence.limits import Limit
     from calibration.lens.board import NAMES, _values
+    from calibration.limits import Limit
 
     judged = {
         "rms": fit.rms,

@@ -1,4 +1,4 @@
-"""How far an alignment has moved since an older one, and whether that is more than both could be wrong."""
+"""Say how far an alignment has moved since an older one, and whether that is more than both could be wrong."""
 
 from __future__ import annotations
 
@@ -10,69 +10,53 @@ from typing import Any
 
 import numpy as np
 
-from calibration.evidence.limits import LIMITS, SIGNIFICANT
-from tofcapture.errors import DataError
+from calibration.evidence.evidence import covariance_of
+from calibration.limits import LIMITS, SIGNIFICANT, worst
 from tofcapture.poses import Float64, check_transform, invert, rotation_log, transform_points
 from tofcapture.rig import load_rig
 
 
 @dataclass(frozen=True)
 class Drift:
-    """New alignment against old.
+    """New alignment against old."""
 
-    Attributes
-    ----------
-    rotation, translation
-        Radians; metres at the working point.
-    twist
-        (6,) (rho, phi): displacement of the working point and rotation vector, ToF frame, new against old.
-    sigmas
-        Square root of the Mahalanobis distance squared over its six degrees of freedom: about 1 where nothing moved.
-    probability
-        Of a drift as large by chance (chi-square, 6 degrees of freedom).
-    basis
-        What the uncertainty was taken from.
-    """
-
+    #: Radians; metres at the working point
     rotation: float
     translation: float
+    #: (6,) (rho, phi): displacement of the working point and rotation vector, ToF frame, new against
+    #: old
     twist: Float64
+    #: Square root of the Mahalanobis distance squared over its six degrees of freedom: about 1 where
+    #: nothing moved
     sigmas: float
-    probability: float
-    basis: str
+    probability: float  #: Of a drift as large by chance (chi-square, 6 degrees of freedom)
+    basis: str  #: What the uncertainty was taken from
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance hardly gives as much."""
+        return self.probability < SIGNIFICANT
 
     @property
     def verdict(self) -> str:
         """PASS where the drift is small or may be chance; else that of its size."""
-        found = {
-            LIMITS["drift_rotation"].verdict(float(np.degrees(self.rotation))),
-            LIMITS["drift_translation"].verdict(1e3 * self.translation),
-        }
-        size = next(v for v in ("FAIL", "WARN", "PASS") if v in found)
-        return size if self.probability < SIGNIFICANT else "PASS"
+        turned = LIMITS["drift_rotation"].verdict(float(np.degrees(self.rotation)))
+        moved = LIMITS["drift_translation"].verdict(1e3 * self.translation)
+        return worst([turned, moved]) if self.significant else "PASS"
 
 
 @dataclass(frozen=True)
 class OldRig:
-    """An older alignment.
+    """An older alignment."""
 
-    Attributes
-    ----------
-    name
-        What it is called, usually a path.
-    T_tof_stereo
-        (4, 4).
-    evidence
-        Of that alignment; without it the old is taken to be as uncertain as the new.
-    """
-
-    name: str
-    T_tof_stereo: Float64
+    name: str  #: What it is called, usually a path
+    T_tof_stereo: Float64  #: (4, 4)
+    #: Of that alignment; without it the old is taken to be as uncertain as the new
     evidence: Mapping[str, Any] | None = None
 
 
 def load_old(path: Path) -> OldRig:
-    """Read an older ``rig.toml`` and, where one lies beside it and belongs to it, its ``evidence.json``.
+    """Read an older ``rig.toml``, and the ``evidence.json`` beside it where that is of this rig.
 
     Raises
     ------
@@ -89,35 +73,20 @@ def load_old(path: Path) -> OldRig:
 
 
 def drift(evidence: Mapping[str, Any], old: OldRig) -> Drift:
-    """Compare an alignment with an older one.
+    """Compare the evidence of an alignment with an older one."""
+    from scipy.stats import chi2
 
-    Parameters
-    ----------
-    evidence
-        Of the new alignment.
-    old
-        The older one.
-
-    Raises
-    ------
-    DataError
-        The evidence holds no uncertainty.
-    """
     new = check_transform(evidence["T_tof_stereo"], "evidence: T_tof_stereo")
-    point = np.asarray(evidence.get("working_point_m", (0.0, 0.0, 0.8)), dtype=np.float64)
-    moved = new @ invert(old.T_tof_stereo)
+    point = np.asarray(evidence["working_point_m"], dtype=np.float64)
     before = transform_points(old.T_tof_stereo @ invert(new), point)
-    phi = rotation_log(moved[:3, :3])
+    phi = rotation_log((new @ invert(old.T_tof_stereo))[:3, :3])
     xi = np.concatenate([point - before, phi])
     C, basis = uncertainty(evidence)
-    if old.evidence is None:
-        C_old, old_basis = C, "the old alignment taken as equally uncertain"
-    else:
+    C_old, old_basis = C, "the old alignment taken as equally uncertain"
+    if old.evidence is not None:
         C_old, words = uncertainty(old.evidence)
         old_basis = f"old: {words}"
     squared = float(xi @ np.linalg.pinv(C + C_old) @ xi)
-    from scipy.stats import chi2
-
     return Drift(
         float(np.linalg.norm(phi)),
         float(np.linalg.norm(xi[:3])),
@@ -128,6 +97,18 @@ def drift(evidence: Mapping[str, Any], old: OldRig) -> Drift:
     )
 
 
+def uncertainty(evidence: Mapping[str, Any]) -> tuple[Float64, str]:
+    """Return the covariance (6, 6) of (rho, phi) at the working point, m^2 and rad^2, and what it rests on.
+
+    Where the evidence states none, the standard errors are spread evenly over three axes each.
+    """
+    if (C := covariance_of(evidence)) is not None:
+        return C, "its covariance"
+    error = evidence["standard_error"]
+    rho, phi = 1e-3 * error["translation_mm"], np.radians(error["rotation_deg"])
+    return np.diag(np.repeat([rho**2 / 3, phi**2 / 3], 3)), "its standard errors, even over the axes"
+
+
 def drift_table(moved: Drift) -> dict[str, Any]:
     """Return a drift as JSON types: degrees, millimetres."""
     return {
@@ -135,7 +116,7 @@ def drift_table(moved: Drift) -> dict[str, Any]:
         "translation_mm": 1e3 * moved.translation,
         "sigmas": moved.sigmas,
         "probability": moved.probability,
-        "significant": moved.probability < SIGNIFICANT,
+        "significant": moved.significant,
         "verdict": moved.verdict,
         "basis": moved.basis,
     }
@@ -143,42 +124,6 @@ def drift_table(moved: Drift) -> dict[str, Any]:
 
 def drift_text(moved: Drift) -> str:
     """Return a drift as one line."""
-    found = drift_table(moved)
-    return (
-        f"{'since the old':16}{found['rotation_deg']:.3f} deg  {found['translation_mm']:.2f} mm, "
-        f"{found['sigmas']:.1f} sigma: {'significant' if found['significant'] else 'not significant'}, {found['verdict']}"
-    )
-
-
-def uncertainty(evidence: Mapping[str, Any]) -> tuple[Float64, str]:
-    """Covariance (6, 6) of (rho, phi) at the working point, m^2 and rad^2, and what it rests on.
-
-    Without a covariance the standard errors are spread evenly over three axes each.
-
-    Raises
-    ------
-    DataError
-        Neither is there.
-    """
-    given = covariance_of(evidence)
-    if given is not None:
-        return given, "its covariance"
-    error = evidence.get("standard_error")
-    if not error:
-        raise DataError(
-            "evidence: expected a covariance or a standard error", hint="run tofcapture align again"
-        )
-    rho, phi = 1e-3 * error["translation_mm"], np.radians(error["rotation_deg"])
-    return np.diag(np.repeat([rho**2 / 3, phi**2 / 3], 3)), "its standard errors, even over the axes"
-
-
-def covariance_of(evidence: Mapping[str, Any]) -> Float64 | None:
-    """Return the (6, 6) covariance of an evidence, in whichever of its forms, or None."""
-    given = evidence.get("covariance")
-    if isinstance(given, Mapping):
-        given = next((v for v in given.values() if isinstance(v, list) and len(v) == 6), None)
-    try:
-        C = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    return C if C.shape == (6, 6) and np.isfinite(C).all() and (np.diag(C) > 0).all() else None
+    size = f"{np.degrees(moved.rotation):.3f} deg  {1e3 * moved.translation:.2f} mm"
+    word = "significant" if moved.significant else "not significant"
+    return f"{'since the old':16}{size}, {moved.sigmas:.1f} sigma: {word}, {moved.verdict}"

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.board.rims import REPEAT, rim_cloud, stereo_rims
 from calibration.registration.backends import FINE, register
 from calibration.registration.clouds import Cloud, stereo_cloud
 from calibration.registration.gate import Refusal, check_registration
 from calibration.registration.pairs import calibration_views
-from calibration.registration.pinned import pinned_worker
+from calibration.registration.rims import REPEAT, rim_cloud, stereo_rims
 from tofcapture.errors import QualityError
+from tofcapture.pool import Pool
 from tofcapture.poses import Float64, invert
 
 SURFACE_POINTS = 40_000  # of the moving cloud; the fixed one stays dense
@@ -61,13 +61,13 @@ def recording_pairs(
     """
     paths = calibration_views(recording)
     fixed, hand, target, refused = _seen(paths[0]), [], [], []
-    with pinned_worker() as worker:
+    with Pool(1, pinned=True) as pool:
         for i, path in enumerate(paths):
             progress("registering", i, len(paths))
             view = fixed if i == 0 else _seen(path)
             guess = invert(fixed.camera) @ view.camera
             source = _source(view)
-            result = worker.submit(register, "open3d", source, fixed.cloud, guess, STAGES).result()
+            result = pool.call(register, "open3d", source, fixed.cloud, guess, STAGES)
             refusal = check_registration(result, source, fixed.cloud, guess)
             if refusal in (None, Refusal.POOR_FIT):  # what one view sees and the other does not is no misfit
                 hand.append(view.hand)
@@ -86,9 +86,8 @@ def _seen(path: Path) -> _Seen:
     from tofcapture.files.view import read_view
 
     view = read_view(path)
-    dense = stereo_cloud(view.stereo)
     held = rim_cloud(stereo_rims(view.stereo.points), np.zeros(3))
-    cloud = Cloud(np.concatenate([held.points, dense.points]), np.concatenate([held.normals, dense.normals]))
+    cloud = held + stereo_cloud(view.stereo)
     hand = view.arm_before.T_base_flange
     return _Seen(hand, hand @ view.rig.T_flange_stereo, cloud, held.points)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.board.model import Model, clear_of_walls, on_front
+from calibration.board.fit import Model, clear_of_walls, on_front
 from calibration.lens.model import LensRefused
 from calibration.registration.gate import tukey_weights
 from tofcapture.camera import Camera

@@ -1,88 +1,135 @@
-"""Range errors per modulation frequency as linear unknowns, and their way into ``rig.toml``.
+"""The terms of a frequency's range error as columns of a linear problem, and their way back into a :class:`RangeError`.
 
-``e_f = o + p rho + sum_m a_m cos(m phi) + b_m sin(m phi)``, phi the phase of the modulation f over the whole path, rho the
-pixel's distance to the principal point (docs: method 0.4), and beside it the light that the lens scatters, whose shares are
-common to all frequencies.
+The joint alignment and ``calibrate range`` choose from one set of terms, by name: ``offset``, ``scale``, ``radius``, ``image 11``
+(the powers of x and y), ``cos 2`` and ``sin 2`` (the order), ``temperature`` and ``darkness``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.alignment.joint_views import HALO_RADII, JointView
 from tofcapture.poses import Float64
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError
 
 ORDERS = (1, 2, 4)  # the slow first one and the even orders of a square-wave light
-TERMS = 2 + 2 * len(ORDERS)
-# One sigma of what is not known before, wide enough for a camera without a factory calibration. It only settles what the
-# views do not: metres, metres per pixel, metres, share of the light.
-PRIOR_OFFSET = 0.02
-PRIOR_RADIUS = 2e-4
-PRIOR_HARMONIC = 0.006
-PRIOR_HALO = 0.003
+IMAGE = ("image 10", "image 01", "image 20", "image 11", "image 02")
+WAVES = {"cos": np.cos, "sin": np.sin}
 
 
-def unknowns(frequencies: int) -> int:
-    """How many coefficients describe the range error of so many frequencies."""
-    return frequencies * TERMS + len(HALO_RADII)
+def waves(orders: Sequence[int]) -> tuple[str, ...]:
+    """Name the terms of harmonics."""
+    return tuple(f"{f} {m}" for m in orders for f in WAVES)
 
 
-def prior_sigma(frequencies: int) -> Float64:
-    """One sigma (U,) of each coefficient before any view was seen."""
-    own = [PRIOR_OFFSET, PRIOR_RADIUS, *[PRIOR_HARMONIC] * (2 * len(ORDERS))]
-    return np.array(own * frequencies + [PRIOR_HALO] * len(HALO_RADII))
+SIMPLE = ("offset", "radius", *waves(ORDERS))  # what is found together with a rig transform
 
 
-def design(view: JointView, frequency: int, coefficients: Float64) -> Float64:
-    """What each coefficient multiplies, (N, U), in the range error of one frequency at a view's pixels.
+@dataclass(frozen=True)
+class Terms:
+    """Name the terms of one frequency's range error.
 
-    The error is a function of the true range, so the measured one is first freed of ``coefficients`` (U,).
+    Attributes
+    ----------
+    modulation_hz
+        The frequency.
+    names
+        T names, in the order of the columns.
+    reference_celsius
+        Where the temperature's term is zero.
     """
-    count = len(view.modulation_hz)
-    out = np.zeros((len(view.rays), unknowns(count)))
-    out[:, count * TERMS :] = view.halos[frequency]
-    own = slice(frequency * TERMS, (frequency + 1) * TERMS)
-    true = view.ranges[frequency]
-    for _ in range(2):
-        phase = 4 * np.pi * view.modulation_hz[frequency] / SPEED_OF_LIGHT * true
-        waves = [f(m * phase) for m in ORDERS for f in (np.cos, np.sin)]
-        out[:, own] = np.stack([np.ones_like(phase), view.radius_px, *waves], axis=-1)
-        true = view.ranges[frequency] - out @ coefficients
-    return out
+
+    modulation_hz: float
+    names: tuple[str, ...] = SIMPLE
+    reference_celsius: float = RangeError.reference_celsius
+
+    def columns(
+        self,
+        range_: Float64,
+        radius_px: Float64,
+        place: Float64 | None = None,
+        celsius: float = np.nan,
+        amplitude: Float64 | None = None,
+    ) -> Float64:
+        """Say what each coefficient multiplies.
+
+        Parameters
+        ----------
+        range_
+            (N,) true ranges, metres: half the path of the light.
+        radius_px
+            (N,) distances to the principal point, pixels.
+        place
+            (N, 2) of :func:`tofcapture.rig.image_places`; for terms over the image.
+        celsius
+            Temperature of the sensor; for its term.
+        amplitude
+            (N,) raw units; for the term of dark surfaces.
+
+        Returns
+        -------
+        (N, T) float64.
+        """
+        phase = 4 * np.pi * self.modulation_hz / SPEED_OF_LIGHT * range_
+        out = []
+        for name in self.names:
+            kind, _, index = name.partition(" ")
+            if kind in WAVES:
+                out.append(WAVES[kind](int(index) * phase))
+            elif kind == "image" and place is not None:
+                out.append(place[:, 0] ** int(index[0]) * place[:, 1] ** int(index[1]))
+            elif kind == "darkness" and amplitude is not None:
+                out.append(1 / amplitude)
+            elif kind == "temperature":
+                out.append(np.full_like(range_, celsius - self.reference_celsius))
+            else:
+                out.append({"offset": np.ones_like(range_), "scale": range_, "radius": radius_px}[kind])
+        return np.stack(out, axis=-1)
+
+    def added(self, error: RangeError, x: Float64) -> RangeError:
+        """Add coefficients (T,) to a range error, term by term; what was not fitted stays."""
+        found = dict(zip(self.names, x.tolist(), strict=True))
+        harmonics = {m: [a, b] for m, a, b in error.harmonics}
+        image = {(i, j): c for i, j, c in error.image}
+        for name, value in found.items():
+            kind, _, index = name.partition(" ")
+            if kind in WAVES:
+                harmonics.setdefault(int(index), [0.0, 0.0])[list(WAVES).index(kind)] += value
+            elif kind == "image":
+                powers = int(index[0]), int(index[1])
+                image[powers] = image.get(powers, 0.0) + value
+        return replace(
+            error,
+            offset=error.offset + found["offset"],
+            scale=error.scale + found.get("scale", 0.0),
+            per_pixel_radius=error.per_pixel_radius + found.get("radius", 0.0),
+            per_kelvin=error.per_kelvin + found.get("temperature", 0.0),
+            per_inverse_amplitude=error.per_inverse_amplitude + found.get("darkness", 0.0),
+            harmonics=tuple((m, a, b) for m, (a, b) in sorted(harmonics.items())),
+            image=tuple((i, j, c) for (i, j), c in sorted(image.items())),
+        )
 
 
-def composed(
-    factory: Sequence[RangeError], modulation_hz: Sequence[float], coefficients: Float64
-) -> tuple[RangeError, ...]:
-    """Sum of the factory's range errors and the fitted ones, one per frequency.
+def jackknife(left_out: Float64) -> tuple[Float64, Float64]:
+    """Say what leaving views out says of a result.
 
     Parameters
     ----------
-    factory
-        What was taken off before the fit; may lack frequencies.
-    modulation_hz
-        (F,) ascending.
-    coefficients
-        (U,) of :func:`design`; shares of scattered light have no place in a :class:`RangeError` and are left out.
+    left_out
+        (N, K) results without each of the views in turn; transforms as twists from any fixed one near them.
+
+    Returns
+    -------
+    influence
+        (N, K) how far each view alone departs from all: Tukey's pseudo-values about their mean.
+    covariance
+        (K, K), widened by Student's t so that one sigma holds 68 % of the time however few the views are.
     """
-    known = {e.modulation_hz: e for e in factory}
-    return tuple(
-        _sum(known.get(hz, RangeError(hz)), coefficients[i * TERMS : (i + 1) * TERMS])
-        for i, hz in enumerate(modulation_hz)
-    )
+    from scipy.stats import norm, t
 
-
-def _sum(error: RangeError, own: Float64) -> RangeError:
-    waves = {m: np.array([a, b]) for m, a, b in error.harmonics}
-    for i, m in enumerate(ORDERS):
-        waves[m] = waves.get(m, np.zeros(2)) + own[2 + 2 * i : 4 + 2 * i]
-    return replace(
-        error,
-        offset=error.offset + float(own[0]),
-        per_pixel_radius=error.per_pixel_radius + float(own[1]),
-        harmonics=tuple((m, float(a), float(b)) for m, (a, b) in sorted(waves.items())),
-    )
+    n = len(left_out)
+    influence: Float64 = (n - 1) * (left_out.mean(axis=0) - left_out)
+    widened = float(t.ppf(norm.cdf(1.0), n - 1)) ** 2
+    return influence, widened * influence.T @ influence / (n * (n - 1))

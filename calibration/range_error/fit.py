@@ -2,7 +2,7 @@
 
 Unknown are the terms of every frequency (:mod:`calibration.range_error.terms`), a twist of the rig transform with the prior that the
 alignment gives it, and per view and frequency a small error of its own, linear over the image: light that the surroundings throw
-back. The size of the latter is estimated from the views (expectation maximisation, as in :mod:`calibration.alignment.joint_icp`), so that a
+back. The size of the latter is estimated from the views (expectation maximisation, as in :mod:`calibration.alignment.joint`), so that a
 spoilt frequency leans less on its views without being told.
 """
 

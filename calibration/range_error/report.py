@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.evidence.limits import Limit
+from calibration.limits import Limit
 from calibration.range_error.fit import RangeFit
 from calibration.range_error.terms import MIN_GREY, MIN_KELVIN, greys, warmed
 from tofcapture.poses import Float64

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.alignment.fusion import jackknife
+from calibration.range_error.error import jackknife
 from tofcapture.poses import Float64
 
 OWN = 3  # a view's own error: offset and slopes over the image

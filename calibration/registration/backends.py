@@ -1,60 +1,80 @@
 """Libraries that register two clouds, behind one signature.
 
-Every backend maps ``(source, target, initial, distances)`` to a measured :class:`~calibration.registration.gate.Registration`. The
-dense, clean cloud is the target: registering ToF points into it and inverting is four times as accurate as the other way
+The dense, clean cloud is the target: registering ToF points into it and inverting is four times as accurate as the other way
 round, because its normals are good.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from typing import Any
+
+import numpy as np
 
 from calibration.registration.clouds import Cloud
 from calibration.registration.gate import Registration, check_clouds, measure_registration
-from calibration.registration.small_gicp_backend import register_small_gicp
 from tofcapture.errors import ConfigError
 from tofcapture.o3d import load_open3d
 from tofcapture.poses import Float64
 
 COARSE_TO_FINE = (0.080, 0.040, 0.020, 0.010)  # m, correspondence distances
 FINE = (0.020, 0.010)  # m, from a good initial guess
-COARSE_STRIDE = (
-    4  # above FINE every fourth source point finds the same basin; point-to-point gains nothing from the rest
-)
+COARSE_STRIDE = 4  # above FINE every fourth point finds the same basin
 MAX_ITERATIONS = 50
+NEIGHBOURS = 20  # that small_gicp makes a normal of
 
-Backend = Callable[[Float64, Cloud, Float64, Sequence[float]], Registration]
+Backend = Callable[[Float64, Cloud, Float64, Sequence[float]], Float64]
 
 
-def register_open3d(
-    source: Float64, target: Cloud, initial: Float64, distances: Sequence[float] = COARSE_TO_FINE
+def register(
+    backend: str,
+    source: Float64,
+    target: Cloud,
+    initial: Float64,
+    distances: Sequence[float] = COARSE_TO_FINE,
 ) -> Registration:
-    """Register by Open3D's point-to-plane ICP with Tukey's robust kernel, coarse to fine.
+    """Register by the backend of that name and measure the result with our own code.
 
     Parameters
     ----------
+    backend
+        One of ``BACKENDS``.
     source
         (N, 3) finite, source frame, metres.
     target
         Dense cloud with normals, target frame.
     initial
-        (4, 4) ``T_target_source`` to start from.
+        (4, 4) ``T_target_source`` to start from; the result stays there where the clouds are empty.
     distances
-        Correspondence distances, metres, descending; also the kernel's scale.
+        Correspondence distances, metres, descending; also the scale of a robust kernel.
 
-    Returns
-    -------
-    Registration
-        Measured by our own code. Where the clouds are empty it stays at ``initial``.
+    Raises
+    ------
+    ConfigError
+        Unknown backend, or its library is not installed.
 
     Notes
     -----
-    Open3D sums in parallel and is bit-reproducible only on one core that was pinned before its import:
-    :mod:`calibration.registration.pinned`.
+    Open3D and kiss-icp sum in parallel. They are bit-reproducible only in a process that was held to one core before it loaded
+    them: ``Pool(1, pinned=True)`` of :mod:`tofcapture.pool`.
     """
-    if check_clouds(source, target) is not None:
-        return measure_registration(initial, source, target)
+    method = backend_named(backend)
+    empty = check_clouds(source, target) is not None
+    return measure_registration(
+        initial if empty else method(source, target, initial, distances), source, target
+    )
+
+
+def backend_named(name: str) -> Backend:
+    """Look a backend up; :class:`ConfigError` names those there are."""
+    if name not in BACKENDS:
+        raise ConfigError(f"backend: expected one of {', '.join(BACKENDS)}, got {name!r}")
+    return BACKENDS[name]
+
+
+def _open3d(source: Float64, target: Cloud, initial: Float64, distances: Sequence[float]) -> Float64:
+    """Point-to-plane with Tukey's robust kernel, coarse to fine."""
     o3d = load_open3d()
     icp = o3d.pipelines.registration
     dense = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(target.points))
@@ -66,25 +86,13 @@ def register_open3d(
         points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(thin))
         to_plane = icp.TransformationEstimationPointToPlane(icp.TukeyLoss(k=distance))
         T = icp.registration_icp(points, dense, distance, T, to_plane, stop).transformation
-    return measure_registration(T, source, target)
+    return T
 
 
-def register_kiss_icp(
-    source: Float64, target: Cloud, initial: Float64, distances: Sequence[float] = COARSE_TO_FINE
-) -> Registration:
-    """Register by kiss-icp's point-to-point ICP with a Geman-McClure kernel, coarse to fine.
-
-    A cross-check of the default backend: kiss-icp is made for odometry, and point-to-point is less accurate.
-    Parameters, returns and notes as in :func:`register_open3d`.
-
-    Raises
-    ------
-    ConfigError
-        When kiss-icp is not installed.
-    """
-    if check_clouds(source, target) is not None:
-        return measure_registration(initial, source, target)
-    mapping, registration = _load_kiss_icp()
+def _kiss_icp(source: Float64, target: Cloud, initial: Float64, distances: Sequence[float]) -> Float64:
+    """Point-to-point with a Geman-McClure kernel: a cross-check, made for odometry and less accurate."""
+    mapping = _library("kiss_icp.mapping", "pip install 'tofcapture[capture]'")
+    registration = _library("kiss_icp.registration", "pip install 'tofcapture[capture]'")
     solver = registration.Registration(2 * MAX_ITERATIONS, 1e-5, 1)
     T = initial
     for distance in distances:
@@ -92,41 +100,30 @@ def register_kiss_icp(
         dense = mapping.VoxelHashMap(distance, 100.0, 20)
         dense.add_points(target.points)
         T = solver.align_points_to_map(source[::COARSE_STRIDE], dense, T, distance, distance / 3)
-    return measure_registration(T, source, target)
+    return T
 
 
-BACKENDS: dict[str, Backend] = {
-    "open3d": register_open3d,
-    "kiss-icp": register_kiss_icp,
-    "small-gicp": register_small_gicp,
-}
+def _small_gicp(source: Float64, target: Cloud, initial: Float64, distances: Sequence[float]) -> Float64:
+    """Point-to-plane on one thread: a cross-check without a robust kernel, so that all within the distance counts in full."""
+    library = _library("small_gicp", "pip install 'tofcapture[gicp]'")
+    dense = library.PointCloud(target.points)
+    tree = library.KdTree(dense, 1)
+    # The library takes no normals from outside; on rims it finds those of a line, which hold less than ours.
+    library.estimate_normals(dense, tree, NEIGHBOURS, 1)
+    points = library.PointCloud(source)
+    T = np.asarray(initial, dtype=np.float64)
+    for distance in distances:
+        found = library.align(dense, points, tree, T, "PLANE_ICP", distance, 1, MAX_ITERATIONS, 1e-6, 1e-6)
+        T = found.T_target_source
+    return np.asarray(T)
 
 
-def backend_named(name: str) -> Backend:
-    """Look a backend up.
-
-    Raises
-    ------
-    ConfigError
-        Unknown name.
-    """
-    if name not in BACKENDS:
-        raise ConfigError(f"backend: expected one of {', '.join(BACKENDS)}, got {name!r}")
-    return BACKENDS[name]
+BACKENDS: dict[str, Backend] = {"open3d": _open3d, "kiss-icp": _kiss_icp, "small-gicp": _small_gicp}
 
 
-def register(
-    name: str, source: Float64, target: Cloud, initial: Float64, distances: Sequence[float] = COARSE_TO_FINE
-) -> Registration:
-    """Register by the backend of that name; a plain function, so that it travels to a worker process."""
-    return backend_named(name)(source, target, initial, distances)
-
-
-def _load_kiss_icp() -> tuple[Any, Any]:
+def _library(module: str, hint: str) -> Any:
     try:
-        from kiss_icp import mapping, registration
+        return import_module(module)
     except ImportError as err:
-        raise ConfigError(
-            f"kiss-icp is needed here and does not load: {err}", hint="pip install 'tofcapture[capture]'"
-        ) from err
-    return mapping, registration
+        name = module.split(".", maxsplit=1)[0].replace("_", "-")
+        raise ConfigError(f"{name} is needed here and does not load: {err}", hint) from err

@@ -1,7 +1,7 @@
 """Points worth aligning: what a ToF burst and a stereo frame of one view say with certainty.
 
-Averaged ICP is limited by bias, not by noise: flying pixels shrink holes, saturated and dark pixels bend planes. So
-points are dropped freely here; tens of thousands remain.
+Averaged ICP is limited by bias, not by noise: flying pixels shrink holes, saturated and dark pixels bend planes. So points are
+dropped freely here, and tens of thousands remain.
 """
 
 from __future__ import annotations
@@ -19,10 +19,7 @@ from tofcapture.rig import SPEED_OF_LIGHT
 
 Mask = NDArray[np.bool_]
 
-WORKING_DEPTH = (
-    0.2,
-    1.8,
-)  # m; where a 240x180 sensor of this kind measures validly (UD-ToF: 0.180 to 1.788 m)
+WORKING_DEPTH = (0.2, 1.8)  # m, where a 240x180 sensor of this kind measures (UD-ToF: 0.180 to 1.788 m)
 TOF_JUMP = 0.012  # m; departure from the local plane that marks a depth edge, over 4 sigma of a burst's noise
 TOF_MARGIN = 2  # px around a ToF depth edge that mixed pixels may reach
 STEREO_JUMP = 0.004  # m; the same on the reduced stereo grid, whose noise is ten times lower
@@ -32,17 +29,11 @@ MAX_SIGMA = 0.004  # m; predicted range noise of a burst-averaged pixel above wh
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points with the directions along which they are held.
+    """Points with the directions along which they are held."""
 
-    Attributes
-    ----------
-    points
-        (N, 3) float64, metres, finite.
-    normals
-        (N, 3) float64, unit: of the surface, facing the camera at the origin of the points' frame; of a rim, across it.
-    """
-
-    points: Float64
+    points: Float64  #: (N, 3) float64, metres, finite
+    #: (N, 3) float64, unit: of a surface, facing the camera at the origin of the points' frame; of a
+    #: rim, across it
     normals: Float64
 
     def __post_init__(self) -> None:
@@ -54,21 +45,25 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.points)
 
+    def __add__(self, other: Cloud) -> Cloud:
+        """Put the other cloud's points behind these."""
+        return Cloud(
+            np.concatenate([self.points, other.points]), np.concatenate([self.normals, other.normals])
+        )
+
 
 def dilate(mask: Mask, pixels: int) -> Mask:
     """Grow a mask (H, W) by a square of ``2 pixels + 1``."""
-    out = np.pad(mask, pixels)
-    for axis in (0, 1):
-        windows = np.lib.stride_tricks.sliding_window_view(out, 2 * pixels + 1, axis=axis)
-        out = np.asarray(windows.any(axis=-1))
-    return out
+    from scipy.ndimage import maximum_filter
+
+    return np.asarray(maximum_filter(mask, 2 * pixels + 1, mode="constant"))
 
 
 def plane_departure(depth: NDArray[np.floating]) -> Float64:
-    """How far each pixel lies off the line through its two neighbours, the larger of both image axes.
+    """Measure how far each pixel lies off the line through its two neighbours, the larger of both image axes.
 
-    Inverse depth is linear in the pixel coordinates on any plane, however tilted, so that its second difference is zero there
-    and is one half jump at a depth edge.
+    Inverse depth is linear in the pixel coordinates on any plane. Its second difference is zero there, and one half jump at a
+    depth edge.
 
     Parameters
     ----------
@@ -88,16 +83,9 @@ def plane_departure(depth: NDArray[np.floating]) -> Float64:
 
 
 def grid_normals(points: NDArray[np.floating]) -> Float64:
-    """Normals of an organised point map, from its tangents smoothed over 3 x 3.
+    """Compute normals (H, W, 3) of an organised point map (H, W, 3) from its tangents, smoothed over 3 x 3.
 
-    Parameters
-    ----------
-    points
-        (H, W, 3), camera frame, metres; NaN where nothing was measured.
-
-    Returns
-    -------
-    (H, W, 3) float64, unit, facing the camera; NaN where a pixel of the 3 x 3 window is missing.
+    They are unit and face the camera; NaN where a pixel of the 3 x 3 window is missing.
     """
     P = np.pad(np.asarray(points, dtype=np.float64), ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
     rows = P[:-2] + P[1:-1] + P[2:]
@@ -110,19 +98,15 @@ def grid_normals(points: NDArray[np.floating]) -> Float64:
 
 
 def range_sigma(burst: TofBurst) -> Float64:
-    """Noise of the burst-averaged range of each pixel, predicted from the burst's own scatter.
+    """Predict the noise (H, W) of the burst-averaged range, metres, from the burst's own scatter.
 
-    ``sigma_r = c / (4 pi f) sigma_z / A`` at the highest frequency (method: ``sigma_phi = sigma_z / A``), where ``sigma_z`` is
-    one number, the median over the pixels, so that ten frames estimate it well.
-
-    Returns
-    -------
-    (H, W) float64, metres; zero for a burst of one frame, which cannot tell.
+    ``sigma_r = c / (4 pi f) sigma_z / A`` at the highest frequency (method: ``sigma_phi = sigma_z / A``). ``sigma_z`` is one
+    number, the median over the pixels, so that ten frames estimate it well. A burst of one frame cannot tell and gives zero.
     """
     info, frames = burst.info, len(burst.raw)
-    z = phase.phasors(burst.raw, info.modulation_hz, info.phase_rad)[:, -1]
     if frames < 2:
         return np.zeros(info.camera.shape)
+    z = phase.phasors(burst.raw, info.modulation_hz, info.phase_rad)[:, -1]
     scatter = np.sqrt(np.median(z.var(axis=0, ddof=1) / 2) / frames)
     amplitude = np.maximum(np.abs(z.mean(axis=0)), 1e-9)
     out: Float64 = SPEED_OF_LIGHT / (4 * np.pi * max(info.modulation_hz)) * scatter / amplitude
@@ -130,14 +114,9 @@ def range_sigma(burst: TofBurst) -> Float64:
 
 
 def tof_depth(burst: TofBurst) -> tuple[NDArray[np.complex128], Float64]:
-    """Average a burst as phasors and decode it with the camera's own range errors.
+    """Average a burst as phasors (F, H, W), raw units, and decode it with the camera's own range errors.
 
-    Returns
-    -------
-    phasor
-        (F, H, W) complex128, raw units.
-    depth
-        (H, W) float64, metres; NaN where a tap was saturated or nothing can be decoded.
+    The depth (H, W), metres, is NaN where a tap was saturated or nothing can be decoded.
     """
     info = burst.info
     saturated = np.asarray((burst.raw >= info.saturation).any(axis=(0, 1)))
@@ -150,22 +129,11 @@ def tof_depth(burst: TofBurst) -> tuple[NDArray[np.complex128], Float64]:
 
 
 def surface_points(burst: TofBurst, depth: Float64) -> Float64:
-    """Trustworthy points on the surface that the rig looks at.
+    """Choose trustworthy points (N, 3), ToF frame, metres, on the surface that the rig looks at.
 
     Dark pixels, pixels within two of a depth edge and everything outside the working depth are dropped. What is left falls
-    apart into pieces; the one that fills most of the image's centre is the board. Other surfaces see the board's light, which
-    lengthens their ranges by up to a centimetre.
-
-    Parameters
-    ----------
-    burst
-        Raw frames.
-    depth
-        (H, W) of :func:`tof_depth`, metres.
-
-    Returns
-    -------
-    (N, 3) float64, ToF frame, metres.
+    into pieces, and the one that fills most of the image's centre is the board. Other surfaces see the board's light, which
+    lengthens their ranges by up to a centimetre. ``depth`` is that of :func:`tof_depth`.
     """
     from scipy.ndimage import label
 
@@ -176,31 +144,18 @@ def surface_points(burst: TofBurst, depth: Float64) -> Float64:
     centre = pieces[height // 4 : height - height // 4, width // 4 : width - width // 4]
     sizes = np.bincount(centre.ravel(), minlength=count + 1)
     sizes[0] = 0
-    board = good & (pieces == sizes.argmax())
-    points: Float64 = burst.info.camera.unproject(depth)[board]
+    points: Float64 = burst.info.camera.unproject(depth)[good & (pieces == sizes.argmax())]
     return points
 
 
-def stereo_cloud(frame: StereoFrame, block: int = STEREO_BLOCK) -> Cloud:
-    """Dense stereo points, averaged over blocks of the organised grid, with normals.
+def stereo_cloud(frame: StereoFrame) -> Cloud:
+    """Average dense stereo points over blocks of the organised grid, with normals; stereo frame.
 
-    Blocks that miss more than a quarter of their pixels, or lie at depth edges, where stereo matchers draw veils, are dropped.
-
-    Parameters
-    ----------
-    frame
-        What the stereo camera gave.
-    block
-        Pixels averaged along each axis.
-
-    Returns
-    -------
-    Cloud
-        Stereo frame.
+    Blocks that miss more than a quarter of their pixels are dropped, and those at depth edges, where stereo matchers draw veils.
     """
-    height, width = (n // block for n in frame.points.shape[:2])
-    tiles = frame.points[: height * block, : width * block].reshape(height, block, width, block, 3)
-    points = _block_means(tiles)
+    height, width = (n // STEREO_BLOCK for n in frame.points.shape[:2])
+    whole = frame.points[: height * STEREO_BLOCK, : width * STEREO_BLOCK]
+    points = _block_means(whole.reshape(height, STEREO_BLOCK, width, STEREO_BLOCK, 3))
     normals = grid_normals(points)
     depth = points[..., 2]
     edge = dilate(plane_departure(depth) > STEREO_JUMP, 1)

@@ -1,7 +1,7 @@
-"""What a registration is worth, measured by our own code.
+"""Measure what a registration is worth, and refuse what cannot be believed.
 
 Open3D answers identity for no correspondences, kiss-icp answers the initial guess, small_gicp says ``converged``: no library
-says that it failed. So every result is measured again here against the clouds and passes a gate, or is refused by name.
+says that it failed. So every result is measured again here against the clouds, and passes a gate or is refused by name.
 """
 
 from __future__ import annotations
@@ -40,75 +40,48 @@ class Refusal(StrEnum):
 
 @dataclass(frozen=True)
 class Registration:
-    """One measured registration.
+    """One measured registration."""
 
-    Attributes
-    ----------
-    T_target_source
-        (4, 4), maps source points into the target's frame.
-    inliers
-        Number of source points with a partner within ``INLIER_DISTANCE``.
-    rmse
-        Root mean square point-to-plane distance of the inliers, metres; NaN without inliers.
-    fitness
-        Inliers over source points.
-    information
-        (6, 6) of (translation of ``centre``, rotation about it) in target axes, 1/m^2 and 1/rad^2: ``J^T J / rmse^2``. Its
-        inverse is the covariance that independent residuals would give; bias is not in it.
-    condition
-        Condition number of ``J^T J`` with rotations measured as motion at the inliers' mean radius; infinite when singular.
-    centre
-        (3,) centroid of the inliers, target frame, metres.
-    step
-        (6,) Newton step that is left at this result: (translation of ``centre``, rotation vector), metres and radians.
-    """
-
-    T_target_source: Float64
-    inliers: int
-    rmse: float
-    fitness: float
+    T_target_source: Float64  #: (4, 4), maps source points into the target's frame
+    inliers: int  #: Number of source points with a partner within ``INLIER_DISTANCE``
+    rmse: float  #: Root mean square point-to-plane distance of the inliers, metres; NaN without inliers
+    fitness: float  #: Inliers over source points
+    #: (6, 6) of (translation of ``centre``, rotation about it) in target axes, 1/m^2 and 1/rad^2:
+    #: ``J^T J / rmse^2``. Its inverse is the covariance that independent residuals would give; bias is
+    #: not in it
     information: Float64
+    #: Condition number of ``J^T J`` with rotations measured as motion at the inliers' mean radius;
+    #: infinite when singular
     condition: float
-    centre: Float64
+    centre: Float64  #: (3,) centroid of the inliers, target frame, metres
+    #: (6,) Newton step that is left at this result: (translation of ``centre``, rotation vector),
+    #: metres and radians
     step: Float64
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Point-to-plane residuals of matched points.
+    """Point-to-plane residuals of M matched points."""
 
-    Attributes
-    ----------
-    source
-        (M,) indices into the source points.
-    points, normals
-        (M, 3) moved source points and the normals of their partners, target frame.
-    distance
-        (M,) signed distance of the points to their partners' tangent planes, metres.
-    """
-
-    source: NDArray[np.intp]
+    source: NDArray[np.intp]  #: (M,) indices into the source points
+    #: (M, 3) moved source points and the normals of their partners, target frame
     points: Float64
     normals: Float64
-    distance: Float64
+    distance: Float64  #: (M,) signed distance of the points to their partners' tangent planes, metres
+
+    def jacobian(self, centre: Float64) -> Float64:
+        """Derive the residuals by (translation, rotation about ``centre`` (3,)), target axes: (M, 6)."""
+        return np.concatenate([self.normals, np.cross(self.points - centre, self.normals)], axis=1)
 
 
 def residuals(source: Float64, target: Cloud, T_target_source: Float64) -> Residuals:
-    """Match every source point with the nearest target point within ``INLIER_DISTANCE``.
-
-    Parameters
-    ----------
-    source
-        (N, 3), source frame, metres.
-    target
-        Cloud with normals.
-    T_target_source
-        (4, 4).
-    """
+    """Match every source point (N, 3), metres, with the nearest target point within ``INLIER_DISTANCE``."""
     from scipy.spatial import cKDTree
 
-    once, count = runs(source)
-    moved = transform_points(T_target_source, source[once])
+    # Rim points are repeated to weigh more: each is looked up once.
+    starts = np.flatnonzero(np.concatenate([[True], (source[1:] != source[:-1]).any(axis=1)]))
+    count = np.diff(np.append(starts, len(source)))
+    moved = transform_points(T_target_source, source[starts])
     tree = cKDTree(target.points, balanced_tree=False, compact_nodes=False)
     distance, partner = tree.query(moved, distance_upper_bound=INLIER_DISTANCE)
     moved, distance, partner = (np.repeat(x, count, axis=0) for x in (moved, distance, partner))
@@ -119,19 +92,8 @@ def residuals(source: Float64, target: Cloud, T_target_source: Float64) -> Resid
     return Residuals(matched, moved[matched], normals, signed)
 
 
-def runs(points: Float64) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Where runs of equal points (N, 3) start, and how long they are: points are repeated to weigh more."""
-    starts = np.flatnonzero(np.concatenate([[True], (points[1:] != points[:-1]).any(axis=1)]))
-    return starts, np.diff(np.append(starts, len(points)))
-
-
-def jacobian(found: Residuals, centre: Float64) -> Float64:
-    """Derivative (M, 6) of the residuals by (translation, rotation about ``centre``), target axes."""
-    return np.concatenate([found.normals, np.cross(found.points - centre, found.normals)], axis=1)
-
-
-def tukey_weights(distance: Float64, scale: float = INLIER_DISTANCE) -> Float64:
-    """Tukey's biweight ``(1 - (r/scale)^2)^2``, zero from ``scale`` on."""
+def tukey_weights(distance: Float64, scale: float | Float64 = INLIER_DISTANCE) -> Float64:
+    """Weigh residuals by Tukey's biweight ``(1 - (r/scale)^2)^2``, zero from ``scale`` on."""
     out: Float64 = np.square(np.maximum(1 - np.square(distance / scale), 0))
     return out
 
@@ -150,47 +112,31 @@ def check_clouds(source: Float64, target: Cloud) -> Refusal | None:
 
 
 def measure_registration(T_target_source: Float64, source: Float64, target: Cloud) -> Registration:
-    """Measure what a transform achieves between two clouds.
+    """Measure what a transform achieves between source points (N, 3), metres, and a target cloud.
 
-    Parameters
-    ----------
-    T_target_source
-        (4, 4) to judge.
-    source
-        (N, 3), source frame, metres.
-    target
-        Cloud with normals, target frame.
-
-    Returns
-    -------
-    Registration
-        With no inliers, infinite condition and NaN rmse when nothing lies near.
+    When nothing lies near, the result has no inliers, an infinite condition and an rmse of NaN.
     """
     if check_clouds(source, target) is not None:
-        return _nothing(T_target_source)
+        return _nothing(T_target_source, 0, 0.0)
     found = residuals(source, target, T_target_source)
+    fitness = len(found.source) / len(source)
     if len(found.source) < MIN_POINTS:
-        return _nothing(T_target_source, len(found.source), len(found.source) / len(source))
+        return _nothing(T_target_source, len(found.source), fitness)
     centre = found.points.mean(axis=0)
-    J = jacobian(found, centre)
+    J = found.jacobian(centre)
     weights = tukey_weights(found.distance)[:, None]
     rmse = float(np.sqrt(np.mean(np.square(found.distance))))
     radius = float(np.sqrt(np.mean(np.square(found.points - centre).sum(axis=-1))))
     even = J * np.repeat([1, 1 / radius], 3) / np.sqrt(len(J))
     eigenvalues = np.linalg.eigvalsh(even.T @ even)
     condition = float(eigenvalues[-1] / eigenvalues[0]) if eigenvalues[0] > 1e-15 else np.inf
-    normal = (J * weights).T @ J
-    step = -np.linalg.pinv(normal) @ ((J * weights).T @ found.distance)
+    step = -np.linalg.pinv((J * weights).T @ J) @ ((J * weights).T @ found.distance)
     information = J.T @ J / max(rmse, 1e-9) ** 2
-    fitness = len(J) / len(source)
     return Registration(T_target_source, len(J), rmse, fitness, information, condition, centre, step)
 
 
-def _nothing(T_target_source: Float64, inliers: int = 0, fitness: float = 0.0) -> Registration:
-    centre = T_target_source[:3, 3]
-    return Registration(
-        T_target_source, inliers, np.nan, fitness, np.zeros((6, 6)), np.inf, centre, np.zeros(6)
-    )
+def _nothing(T: Float64, inliers: int, fitness: float) -> Registration:
+    return Registration(T, inliers, np.nan, fitness, np.zeros((6, 6)), np.inf, T[:3, 3], np.zeros(6))
 
 
 def check_registration(
@@ -218,17 +164,11 @@ def check_registration(
         return Refusal.NO_OVERLAP
     if result.condition > MAX_CONDITION:
         return Refusal.PLANAR
-    if _too_far(result, initial):
-        return Refusal.DIVERGED
-    if (
-        np.linalg.norm(result.step[:3]) > MAX_STEP_TRANSLATION
-        or np.linalg.norm(result.step[3:]) > MAX_STEP_ROTATION
-    ):
-        return Refusal.NOT_CONVERGED
-    return Refusal.POOR_FIT if result.rmse > MAX_RMSE else None
-
-
-def _too_far(result: Registration, initial: Float64) -> bool:
     moved = result.T_target_source @ invert(initial)
     shift = transform_points(moved, result.centre) - result.centre
-    return bool(rotation_angle(moved) > MAX_ROTATION or np.linalg.norm(shift) > MAX_TRANSLATION)
+    if rotation_angle(moved) > MAX_ROTATION or np.linalg.norm(shift) > MAX_TRANSLATION:
+        return Refusal.DIVERGED
+    left, turn = np.linalg.norm(result.step[:3]), np.linalg.norm(result.step[3:])
+    if left > MAX_STEP_TRANSLATION or turn > MAX_STEP_ROTATION:
+        return Refusal.NOT_CONVERGED
+    return Refusal.POOR_FIT if result.rmse > MAX_RMSE else None

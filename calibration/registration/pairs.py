@@ -3,66 +3,39 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from calibration.alignment.range_residual import RangeResidual
-from calibration.board.rims import REPEAT, rim_cloud, stereo_rims, tof_rims
 from calibration.registration.clouds import Cloud, stereo_cloud, surface_points, tof_depth
+from calibration.registration.rims import REPEAT, rim_cloud, stereo_rims, tof_rims
 from tofcapture.errors import DataError
+from tofcapture.files.view import read_view
 from tofcapture.frames import View
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig
 
-SCENE = "calibration"
-
 
 @dataclass(frozen=True)
 class Pair:
-    """What one calibration view contributes.
+    """What one calibration view contributes."""
 
-    Attributes
-    ----------
-    name
-        Path of the view inside the recording.
-    sha256
-        Digest of the file.
-    source
-        (N, 3) ToF points, ToF frame, metres: rims, each repeated ``REPEAT`` times as no library takes weights, then surface.
-    target
-        Rims and dense cloud of the stereo camera with normals, stereo frame.
-    rig
-        The rig as it was known when the view was taken.
-    modulation_hz
-        Highest modulation frequency of the ToF camera.
-    truth
-        (4, 4) ``T_tof_stereo`` of a simulated view, else None.
-    """
-
+    #: Path of the view inside the recording, and digest of the file
     name: str
     sha256: str
+    #: (N, 3) ToF points, ToF frame, metres: rims, each repeated ``REPEAT`` times as no library takes
+    #: weights, then surface
     source: Float64
-    target: Cloud
-    rig: Rig
-    modulation_hz: float
-    truth: Float64 | None
-
-    def corrected(self, residual: RangeResidual) -> Pair:
-        """Return the pair with its ToF points freed of a range error."""
-        return replace(self, source=residual.correct(self.source))
+    target: Cloud  #: Rims and dense cloud of the stereo camera with normals, stereo frame
+    rig: Rig  #: The rig as it was known when the view was taken
+    modulation_hz: float  #: Highest modulation frequency of the ToF camera
+    truth: Float64 | None  #: (4, 4) ``T_tof_stereo`` of a simulated view, else None
 
 
 def calibration_views(recording: Path) -> list[Path]:
-    """Find the sealed board views of a recording, in order.
-
-    Raises
-    ------
-    DataError
-        When there are none.
-    """
-    folder = Path(recording) / "views" / SCENE
+    """Find the sealed board views of a recording, in order; :class:`DataError` when there are none."""
+    folder = Path(recording) / "views" / "calibration"
     found = sorted(folder.glob("view-*.h5"))
     if not found:
         raise DataError(
@@ -77,15 +50,12 @@ def pair_of(view: View, name: str, sha256: str) -> Pair:
     info = view.tof.info
     phasor, depth = tof_depth(view.tof)
     rims = np.repeat(tof_rims(phasor, depth, info.camera).points, REPEAT, axis=0)
-    dense = stereo_cloud(view.stereo)
     held = rim_cloud(stereo_rims(view.stereo.points), view.rig.T_stereo_tof[:3, 3])
     return Pair(
         name=name,
         sha256=sha256,
         source=np.concatenate([rims, surface_points(view.tof, depth)]),
-        target=Cloud(
-            np.concatenate([held.points, dense.points]), np.concatenate([held.normals, dense.normals])
-        ),
+        target=held + stereo_cloud(view.stereo),
         rig=view.rig,
         modulation_hz=max(info.modulation_hz),
         truth=None if view.truth is None else view.truth.T_tof_stereo,
@@ -93,15 +63,7 @@ def pair_of(view: View, name: str, sha256: str) -> Pair:
 
 
 def load_pair(recording: Path, path: Path) -> Pair:
-    """Read a view file and reduce it.
-
-    Raises
-    ------
-    DataError
-        Unreadable or damaged, with its path.
-    """
-    from tofcapture.files.view import read_view
-
+    """Read a view file and reduce it; :class:`DataError` names a file that is unreadable or damaged."""
     view = read_view(path)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,12 +1,16 @@
-"""What every command shares: progress with the time left, and tables of a fixed form. Both look the same everywhere."""
+"""What every command shares: progress with the time left, tables of a fixed form, and results as JSON files."""
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
+
+from tofcapture.command import Outcome
 
 PLAIN_EVERY = 10.0  # s between lines where there is no terminal
 
@@ -52,6 +56,16 @@ def table(header: Sequence[str], rows: Sequence[Sequence[object]], indent: str =
         for row in cells
     )
     return "\n".join(f"{indent}{line}".rstrip() for line in lines)
+
+
+def written(data: dict[str, Any], text: str, out: Path | None) -> Outcome:
+    """Make the outcome of a command, written to ``out`` as JSON where a path was given."""
+    if out is not None:
+        from tofcapture.files.seal import write_text
+
+        write_text(out, json.dumps(data, indent=1, allow_nan=False) + "\n")
+        data, text = {**data, "out": str(out)}, f"{text}\n{out}"
+    return Outcome(data=data, text=text)
 
 
 def _lines() -> Report:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tofcapture.errors import ConfigError, DataError
+from tofcapture.errors import ConfigError
 
 if TYPE_CHECKING:
     from calibration.evidence.compare import OldRig
@@ -48,6 +47,7 @@ def write_page(
         No readable evidence or views.
     """
     from calibration.evidence.compare import drift
+    from calibration.evidence.evidence import read_evidence
     from calibration.evidence.page.content import page_content
     from calibration.evidence.page.samples import sample_recording
     from tofcapture.files.seal import write_text
@@ -59,26 +59,6 @@ def write_page(
     out = Path(recording) / "evidence.html"
     write_text(out, render(page_content(found, samples, moved, "" if old is None else old.name)))
     return out
-
-
-def read_evidence(recording: Path) -> dict[str, Any]:
-    """Read ``evidence.json`` of a recording.
-
-    Raises
-    ------
-    DataError
-        Missing, not JSON, or something else.
-    """
-    path = Path(recording) / "evidence.json"
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as err:
-        raise DataError(
-            f"{path}: cannot read the evidence: {err}", hint=f"tofcapture align {recording}"
-        ) from err
-    if not isinstance(found, dict) or found.get("format") != "tofcapture-evidence":
-        raise DataError(f"{path}: expected format tofcapture-evidence", hint=f"tofcapture align {recording}")
-    return found
 
 
 def _template() -> Callable[[Mapping[str, Any]], str]:

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from calibration.board.coverage import coverage
-from calibration.evidence.compare import Drift, covariance_of
-from calibration.evidence.limits import LIMITS, SIGNIFICANT
+from calibration.evidence.compare import Drift
+from calibration.evidence.evidence import covariance_of
 from calibration.evidence.page import charts, checks
 from calibration.evidence.page.samples import Samples, residual_from
+from calibration.limits import LIMITS, Judged, worst
 from tofcapture.poses import Float64
 
 COMPONENTS = ("tx", "ty", "tz", "rx", "ry", "rz")
@@ -35,7 +36,7 @@ def page_content(
     covered = coverage(samples.poses, samples.camera, np.array(samples.outlines).reshape(-1, 32, 2))
     wave = _wave(evidence, samples)
     sections = [
-        ("views", "Views and their spread", checks.pair_checks(evidence)),
+        ("views", "Views and their spread", [Judged(**c) for c in evidence["checks"]]),
         ("residuals", "Residuals", checks.residual_checks(samples, None if wave is None else wave[1])),
         ("coverage", "Coverage", checks.coverage_checks(covered)),
     ]
@@ -43,8 +44,10 @@ def page_content(
         sections.append(("drift", "Against the old calibration", checks.drift_checks(moved)))
     rows = [c for _, _, found in sections for c in found]
     return {
-        "verdict": checks.worst(rows),
-        "sections": [(key, title, checks.worst(found), found) for key, title, found in sections],
+        "verdict": worst([c.verdict for c in rows]),
+        "sections": [
+            (key, title, worst([c.verdict for c in found]), found) for key, title, found in sections
+        ],
         "problems": [c for c in rows if c.verdict != "PASS"],
         "simulated": bool(evidence.get("truth")),
         "backend": evidence.get("backend", "unknown"),
@@ -196,7 +199,7 @@ def _drift(moved: Drift | None, old_name: str) -> dict[str, Any] | None:
         "components": list(zip(COMPONENTS, stated, strict=True)),
         "sigmas": f"{moved.sigmas:.2f}",
         "probability": f"{moved.probability:.2g}",
-        "significant": moved.probability < SIGNIFICANT,
+        "significant": moved.significant,
         "basis": moved.basis,
     }
 

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.alignment.range_residual import RangeResidual, no_residual
-from calibration.board.rims import rim_cloud, stereo_rims, tof_rims
+from calibration.alignment.rounds import RangeResidual, no_residual
+from calibration.range_error.error import SIMPLE
 from calibration.registration.clouds import stereo_cloud, surface_points, tof_depth
 from calibration.registration.gate import residuals
 from calibration.registration.pairs import calibration_views
+from calibration.registration.rims import rim_cloud, stereo_rims, tof_rims
 from tofcapture.camera import Camera
 from tofcapture.frames import View
 from tofcapture.poses import Float64, check_transform, invert, transform
@@ -95,19 +96,15 @@ def _chosen(paths: list[Path], evidence: Mapping[str, Any]) -> list[Path]:
 
 
 def residual_from(evidence: Mapping[str, Any], camera: Camera) -> RangeResidual:
-    """Range residual that an evidence states; none where it states none.
-
-    Orders that :data:`calibration.alignment.range_residual.ORDERS` does not hold are left out.
-    """
-    from calibration.alignment.range_residual import ORDERS
-
+    """Read the range residual that an evidence states; none where it states none."""
     table = evidence.get("range_residual")
-    if not isinstance(table, Mapping) or "modulation_hz" not in table:
+    if table is None:
         return no_residual(camera, 100e6)
-    waves = {int(m): (float(a), float(b)) for m, a, b in table.get("harmonics", ())}
-    c = [table.get("offset", 0.0), table.get("per_pixel_radius", 0.0)]
-    c += [x for m in ORDERS for x in waves.get(m, (0.0, 0.0))]
-    return RangeResidual(camera, float(table["modulation_hz"]), np.asarray(c, dtype=np.float64))
+    found = {"offset": table["offset"], "radius": table["per_pixel_radius"]}
+    for m, a, b in table["harmonics"]:
+        found |= {f"cos {m}": a, f"sin {m}": b}
+    coefficients = np.array([found.get(name, 0.0) for name in SIMPLE])
+    return RangeResidual(camera, float(table["modulation_hz"]), coefficients)
 
 
 def _sample(view: View, index: int, T_stereo_tof: Float64, evidence: Mapping[str, Any]) -> Samples:

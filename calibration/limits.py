@@ -1,40 +1,40 @@
-"""Every threshold that the evidence of an alignment is judged by, in one table, and what a bad value most likely means.
+"""Judge a calibration: every threshold in one table, and what a bad value most likely means.
 
 The gate of a single pair has its own constants in :mod:`calibration.registration.gate`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-GOOD_ERROR_DEG = 0.1  # standard errors that an alignment for ground truth may have
-GOOD_ERROR_MM = 1.0
+VERDICTS = ("PASS", "WARN", "FAIL")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One judged number as text: what it is, its value and limits, PASS, WARN or FAIL, and the likely cause where it is not PASS."""
+
+    words: str
+    value: str
+    limits: str
+    verdict: str
+    cause: str
 
 
 @dataclass(frozen=True)
 class Limit:
-    """One judged number.
+    """What one number may be."""
 
-    Attributes
-    ----------
-    words
-        What it is.
-    good, bearable
-        PASS up to good, WARN up to bearable, FAIL beyond; downwards where ``good`` is the larger.
-    unit
-        As printed.
-    cause
-        What a bad value most likely means, and what to do.
-    """
-
-    words: str
+    words: str  #: What it is
+    #: PASS up to good, WARN up to bearable, FAIL beyond; downwards where ``good`` is the larger
     good: float
     bearable: float
-    unit: str
-    cause: str
+    unit: str  #: As printed
+    cause: str  #: What a bad value most likely means, and what to do
 
     def verdict(self, value: float | None) -> str:
-        """PASS, WARN or FAIL; a value that does not exist fails."""
+        """Say PASS, WARN or FAIL; a value that does not exist fails."""
         if value is None or value != value:  # noqa: PLR0124  NaN
             return "FAIL"
         sign = 1 if self.good <= self.bearable else -1
@@ -44,7 +44,7 @@ class Limit:
 
     @property
     def text(self) -> str:
-        """Both limits in words."""
+        """Put both limits in words."""
         word = "to" if self.good <= self.bearable else "from"
         return f"PASS {word} {self.good:g}, WARN {word} {self.bearable:g} {self.unit}".rstrip()
 
@@ -106,3 +106,16 @@ LIMITS: dict[str, Limit] = {
 }  # fmt: skip
 
 SIGNIFICANT = 0.01  # probability of a drift as large by chance below which it counts as real
+
+
+def judged(key: str, value: float | None) -> Judged:
+    """Judge one number by the limit of that name."""
+    limit = LIMITS[key]
+    verdict = limit.verdict(value)
+    text = "none" if value is None or value != value else f"{value:.3g} {limit.unit}".rstrip()  # noqa: PLR0124  NaN
+    return Judged(limit.words, text, limit.text, verdict, "" if verdict == "PASS" else limit.cause)
+
+
+def worst(verdicts: Sequence[str]) -> str:
+    """Return the worst verdict; ``WARN`` where nothing was judged."""
+    return max(verdicts, key=VERDICTS.index, default="WARN")

@@ -1,0 +1,231 @@
+"""Register, gate and average cloud pairs, and take off the range error that they share.
+
+A demodulation that is not a pure sine makes planes wavy by millimetres even after a factory calibration, and ICP tilts to follow
+the waves. The error is common to all views, so that the residuals of all pairs determine it together (method.md 0.4, 6):
+``e = o + p rho + sum_m a_m cos(m k r) + b_m sin(m k r)``, with r the distance along the ray, ``k = 4 pi f / c`` and rho the
+pixel's distance to the principal point. The offset o is told from a translation along the optical axis by the rims.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.alignment.averages import Average, average_transforms
+from calibration.range_error.error import SIMPLE, Terms
+from calibration.registration.backends import COARSE_TO_FINE, FINE, register
+from calibration.registration.gate import (
+    Refusal,
+    Registration,
+    check_registration,
+    residuals,
+    tukey_weights,
+)
+from calibration.registration.pairs import Pair
+from tofcapture.camera import Camera
+from tofcapture.errors import QualityError, TofError
+from tofcapture.pool import Pool
+from tofcapture.poses import Float64, invert, transform_points
+
+MIN_PAIRS = 3  # below this no pair can be told from an outlier
+REFINEMENTS = 2  # rounds of range residual and registration after the first; a third changes 0.1 mm
+# One sigma of what a factory calibration leaves: m, m/px, and m for each wave.
+PRIOR = np.array([0.002, 3e-5, *[0.003] * (len(SIMPLE) - 2)])
+NOISE = 0.011  # m, one sigma of a residual as if independent: 2 mm times the root of ~30 neighbours that share their bias
+STRIDE = 4  # source points skipped; thousands per view remain
+
+Progress = Callable[[str, int, int], None]
+
+
+class RefusedPairsError(QualityError):
+    """Too few pairs passed the gate; ``refusals`` says why which did not."""
+
+    def __init__(self, message: str, hint: str, refusals: Sequence[Refusal | None]) -> None:
+        super().__init__(message, hint)
+        self.refusals = list(refusals)
+
+
+@dataclass(frozen=True)
+class RangeResidual:
+    """The range error that is left in a ToF camera."""
+
+    camera: Camera  #: Intrinsics of the ToF camera
+    modulation_hz: float  #: The frequency whose wave number the orders are multiples of
+    #: (T,) float64 of :data:`calibration.range_error.error.SIMPLE`: offset in metres, metres per pixel
+    #: of radius, cosine and sine amplitude of each order in metres
+    coefficients: Float64
+
+    def correct(self, points: Float64) -> Float64:
+        """Move points (N, 3) of the ToF frame along their rays to where they would be without the error."""
+        error = self.terms(points) @ self.coefficients
+        out: Float64 = points * (1 - error / np.linalg.norm(points, axis=-1))[:, None]
+        return out
+
+    def terms(self, points: Float64) -> Float64:
+        """Compute what each coefficient multiplies, (N, T), at points (N, 3) of the ToF frame."""
+        focal = [self.camera.fx, self.camera.fy]
+        radius = np.linalg.norm(points[:, :2] / points[:, 2:] * focal, axis=-1)
+        return Terms(self.modulation_hz).columns(np.linalg.norm(points, axis=-1), radius)
+
+
+def no_residual(camera: Camera, modulation_hz: float) -> RangeResidual:
+    """Start from no range error."""
+    return RangeResidual(camera, modulation_hz, np.zeros(len(PRIOR)))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """An alignment after a round."""
+
+    #: One per pair; refusal None where the gate let the pair through
+    registrations: list[Registration]
+    refusals: list[Refusal | None]
+    average: Average  #: Of the pairs that passed, ``T_stereo_tof``
+    passed: list[int]  #: Indices of the pairs that passed the gate, in the order of ``average``
+    working_point: Float64  #: (3,) ToF frame, metres: mean of the centroids of the matched points
+    residual: RangeResidual  #: Range error that was taken off the ToF points of this round
+
+    @property
+    def used(self) -> list[int]:
+        """Indices of the pairs in the average."""
+        return [i for i, kept in zip(self.passed, self.average.kept, strict=True) if kept]
+
+
+def solve(
+    pairs: Sequence[Pair],
+    backend: str,
+    T_tof_stereo: Float64,
+    progress: Progress = lambda _stage, _done, _total: None,
+) -> Solution:
+    """Align cloud pairs: register, gate, average; then take off the common range error and do it again, twice.
+
+    Parameters
+    ----------
+    pairs
+        N >= 3 cloud pairs.
+    backend
+        Name of a registration backend.
+    T_tof_stereo
+        (4, 4) initial guess.
+    progress
+        Called with a stage, steps done and steps in all.
+
+    Raises
+    ------
+    RefusedPairsError
+        Fewer than three pairs pass the gate or survive as inliers.
+    """
+    guess = T = invert(T_tof_stereo)
+    residual = no_residual(pairs[0].rig.tof, pairs[0].modulation_hz)
+    distances: Sequence[float] = COARSE_TO_FINE
+    with Pool(1, pinned=True) as pool:
+        for n in range(1 + REFINEMENTS):
+            corrected = [replace(p, source=residual.correct(p.source)) for p in pairs]
+            found = _registered(pool, backend, corrected, T, distances, progress, n * len(pairs))
+            gated = zip(found, corrected, strict=True)
+            refusals = [check_registration(r, p.source, p.target, guess) for r, p in gated]
+            solution = _averaged(found, refusals, residual)
+            if n < REFINEMENTS:
+                used = solution.used
+                residual = fit_range_residual(
+                    [corrected[i] for i in used], [found[i] for i in used], residual
+                )
+            T, distances = solution.average.T, FINE
+    return solution
+
+
+def _registered(
+    pool: Pool,
+    backend: str,
+    pairs: Sequence[Pair],
+    T_start: Float64,
+    distances: Sequence[float],
+    progress: Progress,
+    done: int,
+) -> list[Registration]:
+    tasks = [(backend, p.source, p.target, T_start, distances) for p in pairs]
+    found: dict[int, Registration] = {}
+    for i, result in pool.run(register, tasks):
+        if isinstance(result, TofError):
+            raise result
+        progress("registering", done + len(found), len(pairs) * (1 + REFINEMENTS))
+        found[i] = result
+    return [found[i] for i in range(len(pairs))]
+
+
+def _averaged(
+    results: list[Registration], refusals: list[Refusal | None], residual: RangeResidual
+) -> Solution:
+    passed = [i for i, refusal in enumerate(refusals) if refusal is None]
+    demand_pairs(len(passed), refusals)
+    chosen = [results[i] for i in passed]
+    c = np.mean([transform_points(invert(r.T_target_source), r.centre) for r in chosen], axis=0)
+    average = average_transforms([r.T_target_source for r in chosen], c)
+    demand_pairs(int(average.kept.sum()), refusals)
+    return Solution(results, refusals, average, passed, c, residual)
+
+
+def demand_pairs(good: int, refusals: Sequence[Refusal | None]) -> None:
+    """Raise :class:`RefusedPairsError` where fewer than three pairs are good."""
+    if good >= MIN_PAIRS:
+        return
+    reasons = Counter(str(r) for r in refusals if r is not None).most_common()
+    listed = ", ".join(f"{count} {reason}" for reason, count in reasons) or "no other failed the gate"
+    raise RefusedPairsError(
+        f"expected at least {MIN_PAIRS} good calibration pairs, got {good} of {len(refusals)}: {listed}",
+        "record more board views, tilted 15 to 40 degrees in all directions, or pass a better --initial rig.toml",
+        refusals,
+    )
+
+
+def fit_range_residual(
+    pairs: Sequence[Pair], registrations: Sequence[Registration], start: RangeResidual
+) -> RangeResidual:
+    """Estimate the range error from registered pairs.
+
+    One linear least-squares problem in the shared coefficients and in a small motion of every pair, without which a pair's
+    wrong pose would be explained by waves. Robust by Tukey's weights; a Gaussian prior keeps what the ranges at hand do not
+    determine at zero.
+
+    Parameters
+    ----------
+    pairs
+        As already corrected by ``start``.
+    registrations
+        Result of each pair.
+    start
+        What was corrected before.
+
+    Returns
+    -------
+    RangeResidual
+        Start plus the correction found.
+    """
+    H = np.diag((NOISE / PRIOR) ** 2)
+    g = -H @ start.coefficients
+    for pair, result in zip(pairs, registrations, strict=True):
+        H_pair, g_pair = _pair_equations(pair, result, start)
+        H += H_pair
+        g += g_pair
+    return replace(start, coefficients=start.coefficients + np.linalg.solve(H, g))
+
+
+def _pair_equations(pair: Pair, result: Registration, start: RangeResidual) -> tuple[Float64, Float64]:
+    source = pair.source[::STRIDE]
+    found = residuals(source, pair.target, result.T_target_source)
+    points = source[found.source]
+    radial = np.linalg.norm(points, axis=-1)
+    rays = points / radial[:, None] @ result.T_target_source[:3, :3].T
+    along = (found.normals * rays).sum(axis=-1)
+    waves = start.terms(points) * along[:, None]
+    weights = tukey_weights(found.distance)[:, None]
+    J = found.jacobian(result.centre)
+    # Schur complement: what the pair's own motion explains is taken out.
+    motion = np.linalg.pinv((J * weights).T @ J)
+    cross = (waves * weights).T @ J
+    H = (waves * weights).T @ waves - cross @ motion @ cross.T
+    g = (waves * weights).T @ found.distance - cross @ motion @ ((J * weights).T @ found.distance)
+    return H, g
