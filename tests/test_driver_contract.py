@@ -136,7 +136,7 @@ class _Codes(_Tof):
         (_Floats, "uint16"),
         (_Frozen, "increase"),
         (_Codes, "TofErrors only"),
-        (_Half, "protocol; got .*__enter__.*capture"),
+        (_Half, "protocol of its role, tof; got .*__enter__.*capture"),
     ],
 )
 def test_broken_tof_cameras_are_caught(camera, clause):

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Device(Protocol):
-    """What all devices share; every method has a default."""
+    """The part that all devices share. Every method has a default."""
 
     def __enter__(self) -> Self:
         return self
@@ -124,7 +124,7 @@ class StereoDevice(Device, Protocol):
 
 
 class Operator(Device, Protocol):
-    """Who puts the scene on the table: a person at the console, or the simulator."""
+    """An operator puts the scene on the table: a person at the console, or the simulator."""
 
     @property
     def person(self) -> bool:

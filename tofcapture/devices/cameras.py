@@ -1,4 +1,4 @@
-"""What drivers of cameras share: opening anew after an error, and the file of what a camera said of itself."""
+"""Shared by drivers of cameras: opening anew after an error, and the file of what a camera said of itself."""
 
 from __future__ import annotations
 
@@ -62,13 +62,7 @@ class ReopenedCamera(Device):
 
 
 def read_description(path: Path) -> dict[str, Any] | None:
-    """Read what a camera said of itself when it was first opened; ``None`` when it never was.
-
-    Raises
-    ------
-    ConfigError
-        The file cannot be read or is not TOML.
-    """
+    """Read what a camera said of itself when it was first opened; ``None`` when it never was."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -81,13 +75,7 @@ def read_description(path: Path) -> dict[str, Any] | None:
 
 
 def write_description(path: Path, table: Mapping[str, Any]) -> None:
-    """Keep what a camera said of itself; the same content again writes nothing.
-
-    Raises
-    ------
-    ConfigError
-        The folder cannot be written.
-    """
+    """Keep what a camera said of itself; the same content again writes nothing."""
     import tomli_w
 
     text = tomli_w.dumps(table)
@@ -104,23 +92,9 @@ def write_description(path: Path, table: Mapping[str, Any]) -> None:
 def described(
     said: Mapping[str, Any] | None, table: Mapping[str, Any], wanted: Iterable[str], where: str
 ) -> dict[str, Any]:
-    """Lay the station's settings over what a camera said of itself.
+    """Lay the station's settings over what a camera ``said`` of itself, ``None`` before it was first opened.
 
-    Parameters
-    ----------
-    said
-        ``None`` before the camera was first opened.
-    table
-        The station's ``[tof]`` or ``[stereo]``.
-    wanted
-        Names that the description must have.
-    where
-        For messages.
-
-    Raises
-    ------
-    ConfigError
-        Something is missing.
+    Raises ConfigError when one of the ``wanted`` names is missing.
     """
     merged = {**(said or {}), **{key: table[key] for key in wanted if key in table}}
     if missing := [key for key in wanted if key not in merged]:
@@ -132,13 +106,7 @@ def described(
 
 
 def tof_info(table: Mapping[str, Any], where: str, page: str) -> TofInfo:
-    """Turn a whole table into a ToF camera's description; ``page`` of the documentation is the hint.
-
-    Raises
-    ------
-    ConfigError
-        It says something impossible.
-    """
+    """Turn a whole table into a ToF camera's description; raises ConfigError, with a ``page`` of the docs as the hint."""
     try:
         info = tof_from(table, where)
     except FormatError as err:

@@ -1,9 +1,8 @@
-"""Where the arm and the rig may be: a coarse model, stricter than needed, behind the controller's own safety limits.
+"""A coarse model of where the arm and the rig may be, stricter than needed, behind the controller's own safety limits.
 
-The arm is a chain of points every few centimetres along its links, the rig a ball about its cameras. None may come near the
-table, into the keep-out cylinder about the object, to the arm's own base, or to its upper arm. This is no replacement for
-safety planes in the controller: it only keeps plans out of trouble. Plans are made with it, and drivers of real arms check
-every motion with it.
+The arm is a chain of points every few centimetres along its links, the rig a ball about its cameras. None may come near
+the table, into the keep-out cylinder about the object, to the arm's own base, or to its upper arm. Plans are made with
+it, and drivers of real arms check every motion with it. It does not replace safety planes in the controller.
 """
 
 from __future__ import annotations
@@ -34,39 +33,19 @@ REASONS = ("table", "object", "base", "self")
 
 @dataclass(frozen=True)
 class Stage:
-    """Where things stand, in the base frame, metres.
+    """Places of table, object and board, in the base frame, metres."""
 
-    Attributes
-    ----------
-    table
-        Height of the table top.
-    target
-        (3,) what object views look at.
-    board, board_normal
-        (3,) what calibration views look at, and the direction its front faces.
-    keep_out_radius, keep_out_height
-        Upright cylinder about the target, its height above the table.
-    home
-        (6,) joint angles of a pose from which every view is reached, radians.
-    """
-
-    table: float
-    target: Float64
-    board: Float64
-    board_normal: Float64
-    keep_out_radius: float = 0.30
-    keep_out_height: float = 0.30
-    home: Float64 = field(default_factory=HOME.copy)
+    table: float  # height of the table top
+    target: Float64  # (3,) what object views look at
+    board: Float64  # (3,) what calibration views look at
+    board_normal: Float64  # (3,) the direction that the board's front faces
+    keep_out_radius: float = 0.30  # of an upright cylinder about the target
+    keep_out_height: float = 0.30  # of it, above the table
+    home: Float64 = field(default_factory=HOME.copy)  # (6,) rad; from there every view is reached
 
 
 def stage_of(config: Mapping[str, Any]) -> Stage:
-    """Read the ``[plan]`` table of a station.
-
-    Raises
-    ------
-    ConfigError
-        Missing, with unknown keys, or with anything but finite numbers.
-    """
+    """Read the ``[plan]`` table of a station; raises ConfigError unless all of it are finite numbers of known names."""
     table = config.get("plan")
     if table is None:
         raise ConfigError("station: expected a table [plan] that says where the table and the object stand")
@@ -87,14 +66,7 @@ def stage_of(config: Mapping[str, Any]) -> Stage:
 
 
 def body_points(model: ArmModel, rig: Rig, joints: NDArray[np.floating]) -> tuple[Float64, Float64]:
-    """Points of the arm and of what it carries, base frame, metres.
-
-    Parameters
-    ----------
-    model, rig
-        The arm and what it carries.
-    joints
-        (..., 6), radians.
+    """Points of the arm and of what it carries, base frame, metres, at joint angles (..., 6), radians.
 
     Returns
     -------
@@ -165,10 +137,7 @@ def is_clear(model: ArmModel, rig: Rig, stage: Stage, start: Float64, goal: Floa
 def route(model: ArmModel, rig: Rig, stage: Stage, start: Float64, goal: Float64) -> list[Float64]:
     """Goals (6,) to visit one after the other: straight if nothing is in the way, else by way of home.
 
-    Raises
-    ------
-    MotionRefused
-        When neither way is clear.
+    Raises MotionRefused when neither way is clear.
     """
     for way in ([goal], [stage.home, goal]):
         if all(is_clear(model, rig, stage, a, b) for a, b in zip([start, *way], way, strict=False)):

@@ -70,10 +70,7 @@ class Ensenso(ReopenedCamera, StereoDevice):
     def describe(self) -> StereoInfo:
         """Say what this camera is, from ``station.toml`` and the description file; opens nothing.
 
-        Raises
-        ------
-        ConfigError
-            The camera was never opened and ``station.toml`` does not describe it.
+        Raises ConfigError when the camera was never opened and ``station.toml`` does not describe it.
         """
         where = f"[stereo] {self._serial}"
         said = described(read_description(self._file), self._table, _DESCRIPTION, where)
@@ -154,25 +151,12 @@ def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def metres(points_mm: NDArray[np.float32], shape: tuple[int, int], serial: str) -> NDArray[np.float32]:
-    """Turn a point map into metres.
-
-    Parameters
-    ----------
-    points_mm
-        (H, W, 3) float32 millimetres, NaN (in any coordinate) where nothing was measured.
-    shape
-        (H, W) expected.
-    serial
-        For messages.
-
-    Returns
-    -------
-    (H, W, 3) float32, all three coordinates NaN where any is not finite.
+    """Turn a point map (H, W, 3) float32 into metres; all three coordinates become NaN where any is not finite.
 
     Raises
     ------
     DeviceError
-        Another shape or type; or not one point.
+        Another shape than ``shape`` (H, W), another type; or not one point.
     """
     if points_mm.shape != (*shape, 3) or points_mm.dtype != np.float32:
         raise DeviceError(
@@ -227,13 +211,7 @@ def library(path: str | None) -> Iterator[None]:
 
 @contextmanager
 def _open_camera(serial: str) -> Iterator[Any]:
-    """Open the camera of that serial number; close it on leaving.
-
-    Raises
-    ------
-    DeviceError
-        No such camera, of another kind, in use, or out of reach.
-    """
+    """Open the camera of that serial number, or say why it cannot be; close it on leaving."""
     from nxlib import NxLibItem, context
     from nxlib.constants import VAL_STEREO, VAL_STRUCTURED_LIGHT
 
@@ -319,13 +297,9 @@ def _said_by(camera: Any) -> dict[str, Any]:
         columns = camera["Calibration"]["Stereo"]["Left"]["Camera"].value()
         width, height = camera["Sensor"]["Size"].value()
         intrinsics = {
-            "width": int(width),
-            "height": int(height),
-            "fx": float(columns[0][0]),
-            "fy": float(columns[1][1]),
-            "cx": float(columns[2][0]),
-            "cy": float(columns[2][1]),
-        }
+            "width": int(width), "height": int(height), "fx": float(columns[0][0]), "fy": float(columns[1][1]),
+            "cx": float(columns[2][0]), "cy": float(columns[2][1]),
+        }  # fmt: skip
         return {"model": camera.get_model_name(), "serial": camera.get_serial_number(), "camera": intrinsics}
 
 

@@ -28,27 +28,13 @@ _WRIST = 1e-12  # sin q5 below which q6 is free and set to zero
 
 @dataclass(frozen=True)
 class ArmModel:
-    """Nominal geometry of an arm with a spherical-offset UR wrist.
+    """Nominal geometry of an arm with a UR's wrist of three offset axes."""
 
-    Attributes
-    ----------
-    name
-        ``ur5e`` or ``ur10e``.
-    d
-        (d1, d4, d5, d6), metres.
-    a
-        (a2, a3), metres, both negative.
-    limit
-        Largest joint angle to either side, radians.
-    speed
-        Joint speed that capture moves at, rad/s; far below the arm's limit.
-    """
-
-    name: str
-    d: tuple[float, float, float, float]
-    a: tuple[float, float]
-    limit: float = 2 * np.pi
-    speed: float = 0.5
+    name: str  # ur5e or ur10e
+    d: tuple[float, float, float, float]  # d1, d4, d5, d6, metres
+    a: tuple[float, float]  # a2, a3, metres, both negative
+    limit: float = 2 * np.pi  # largest joint angle to either side, radians
+    speed: float = 0.5  # of joints while capturing, rad/s; far below the arm's limit
 
     @property
     def dh(self) -> Float64:
@@ -65,13 +51,7 @@ MODELS = {
 
 
 def arm_model(name: str) -> ArmModel:
-    """Look up a model.
-
-    Raises
-    ------
-    ConfigError
-        Unknown name.
-    """
+    """Look up a model by name; raises ConfigError for an unknown one."""
     if name not in MODELS:
         raise ConfigError(f"arm model: expected one of {', '.join(MODELS)}, got {name!r}")
     return MODELS[name]
@@ -97,7 +77,7 @@ def check_joints(model: ArmModel, joints: ArrayLike) -> Float64:
 
 
 def wrap(angle: ArrayLike) -> Float64:
-    """Angles into [-pi, pi]."""
+    """Wrap angles into [-pi, pi]."""
     out: Float64 = np.mod(np.asarray(angle, dtype=np.float64) + np.pi, 2 * np.pi) - np.pi
     return out
 
@@ -115,18 +95,9 @@ def _link(row: Float64, q: NDArray[np.floating]) -> Float64:
 
 
 def link_frames(model: ArmModel, q: ArrayLike) -> Float64:
-    """Frames of all links.
+    """Frames of all links, ``T_base_link`` (..., 6, 4, 4), metres, of joint angles (..., 6), radians.
 
-    Parameters
-    ----------
-    model
-        The arm.
-    q
-        (..., 6) joint angles, radians.
-
-    Returns
-    -------
-    (..., 6, 4, 4) float64, ``T_base_link``; the last one is the flange.
+    The last one is the flange.
     """
     q = np.asarray(q, dtype=np.float64)
     if q.shape[-1:] != (6,):
@@ -180,14 +151,7 @@ def _elbow(model: ArmModel, T_1_4: Float64) -> tuple[Float64, Float64, Float64]:
 
 
 def inverse_all(model: ArmModel, T_base_flange: ArrayLike) -> Float64:
-    """All branches of the inverse kinematics of many poses.
-
-    Parameters
-    ----------
-    model
-        The arm.
-    T_base_flange
-        (..., 4, 4), metres.
+    """All branches of the inverse kinematics of many poses (..., 4, 4), metres.
 
     Returns
     -------

@@ -24,38 +24,23 @@ ROLES = tuple(_PROTOCOLS)
 
 @dataclass(frozen=True)
 class StationContext:
-    """What every driver of one station may know.
+    """All that a driver may know of its station.
 
-    Attributes
-    ----------
-    config
-        The whole ``station.toml``.
-    folder
-        Where that file lies; relative paths in it start here.
-    shared
-        What drivers of one station share, such as the simulated world. The station puts every open device here under
-        its role. A driver that knows where the cameras sit on the flange puts a nominal ``Rig`` here under ``rig``.
-    allow_motion
-        The operator allowed real arms to move, in this run.
+    ``shared`` is for what drivers of one station share, such as the simulated world. The station puts every open device
+    there under its role. A driver that knows where the cameras sit on the flange puts a nominal ``Rig`` there, under ``rig``.
     """
 
-    config: Mapping[str, Any]
-    folder: Path
+    config: Mapping[str, Any]  # the whole station.toml
+    folder: Path  # where that file lies; relative paths in it start here
     shared: dict[str, Any] = field(default_factory=dict)
-    allow_motion: bool = False
+    allow_motion: bool = False  # the operator allowed real arms to move, in this run
 
 
 Factory = Callable[[Mapping[str, Any], StationContext], Any]
 
 
 def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
-    """Refuse settings that a driver does not know.
-
-    Raises
-    ------
-    ConfigError
-        Names them, and those that are known; ``where`` is ``[tof]`` or the like.
-    """
+    """Raise ConfigError for settings that are not known, and name those that are; ``where`` is ``[tof]`` or the like."""
     known = tuple(known)
     if unknown := sorted(table.keys() - set(known)):
         hint = f"it knows {', '.join(known)}" if known else "it takes no settings"
@@ -127,13 +112,7 @@ def lacking(role: str, device: object) -> list[str]:
 
 
 def make_target(target: str, table: Mapping[str, Any], context: StationContext) -> Any:
-    """Import ``module:name`` and call it with a device's table and the station's context, as a driver host does.
-
-    Raises
-    ------
-    DeviceError
-        It does not import.
-    """
+    """Import ``module:name`` and call it as a factory, for a driver host; raises DeviceError when it does not import."""
     module, _, name = target.partition(":")
     try:
         factory = getattr(importlib.import_module(module), name)

@@ -36,13 +36,8 @@ _NUMBER = re.compile(r"view-(\d+)\.h5")
 class Replay:
     """One recording and where its replay stands; shared by the devices of one station.
 
-    Parameters
-    ----------
-    recording
-        The recording's folder.
-    order
-        ``"joints"`` serves the view recorded nearest to where the arm is sent; ``"file"`` serves a scene's views by
-        number, one after the other, wherever the arm is sent.
+    The order ``"joints"`` serves the view recorded nearest to where the arm is sent; ``"file"`` serves a scene's views by
+    number, one after the other, wherever the arm is sent.
     """
 
     def __init__(self, recording: Path, order: str) -> None:
@@ -266,7 +261,7 @@ class ReplayStereo(_Replayed, StereoDevice):
 
 
 class ReplayOperator(_Replayed, Operator):
-    """Who placed the recorded scenes."""
+    """The operator who placed the recorded scenes."""
 
     def place(self, scene: str) -> None:
         """Go to a recorded scene."""
@@ -283,18 +278,8 @@ DRIVERS = {"arm": ReplayArm, "tof": ReplayTof, "stereo": ReplayStereo, "operator
 def write_station(recording: Path, folder: Path, order: str = "joints") -> Path:
     """Write a station that replays a recording with the plan, the seed and the rig that it was made with.
 
-    Parameters
-    ----------
-    recording
-        Folder with ``station.toml`` and views.
-    folder
-        Where ``station.toml`` and ``rig.toml`` go; made when missing.
-    order
-        See :class:`Replay`.
-
-    Returns
-    -------
-    Path of the station.
+    ``station.toml`` and ``rig.toml`` go into ``folder``, made when missing; for ``order`` see :class:`Replay`. Returns the
+    path of the station.
     """
     import tomli_w
 

@@ -29,24 +29,14 @@ DEFAULT = Path(__file__).with_name("station.toml")
 
 @dataclass(frozen=True)
 class Station:
-    """Open devices.
-
-    Attributes
-    ----------
-    arm, tof, stereo, operator
-        The devices.
-    rig
-        The rig as it is known before alignment: a drawing, or an earlier ``rig.toml``.
-    config
-        The effective ``station.toml``.
-    """
+    """Open devices."""
 
     arm: Arm
     tof: TofCamera
     stereo: StereoDevice
     operator: Operator
-    rig: Rig
-    config: Mapping[str, Any]
+    rig: Rig  # as known before alignment: a drawing, or an earlier rig.toml
+    config: Mapping[str, Any]  # the effective station.toml
 
     @property
     def seed(self) -> int:
@@ -74,14 +64,7 @@ class Station:
 
 
 def read_station(path: Path | None, seed: int | None = None) -> dict[str, Any]:
-    """Read ``station.toml``, or the embedded simulated station, and check its tables.
-
-    Parameters
-    ----------
-    path
-        The file; ``None`` for the embedded one.
-    seed
-        Replaces ``[sim] seed``.
+    """Read ``station.toml``, or the embedded simulated station, and check its tables; ``seed`` replaces ``[sim] seed``.
 
     Raises
     ------
@@ -150,13 +133,7 @@ def open_station(
 
 
 class LockedArm(Arm):
-    """A real arm in a run that does not allow motion: everything but ``move_to`` works.
-
-    Parameters
-    ----------
-    arm
-        The open arm behind it.
-    """
+    """A real arm, open, in a run that does not allow motion: everything but ``move_to`` works."""
 
     def __init__(self, arm: Arm) -> None:
         self._arm = arm

@@ -1,6 +1,5 @@
-"""For those who write drivers: checks that any driver must pass, and doubles of devices to run them against."""
+"""For those who write drivers: checks that any driver must pass."""
 
-from tofcapture.testing.contract import ContractError, check_arm, check_operator
-from tofcapture.testing.contract_cameras import check_stereo, check_tof
+from tofcapture.testing.contract import ContractError, check_arm, check_operator, check_stereo, check_tof
 
 __all__ = ["ContractError", "check_arm", "check_operator", "check_stereo", "check_tof"]

@@ -1,14 +1,12 @@
-"""The driver contract, as checks that any driver can be put through.
+"""The driver contract, as checks that any driver can be put through; docs/drivers.md has its clauses.
 
-Plain functions without a test framework: each takes ``make``, which makes a new device as its factory would, and raises
-:class:`ContractError` with the clause that is broken. In a test::
+Plain functions without a test framework. ``make`` makes a new, unopened device as its factory would; ``prepare`` is called
+with every open device before it is used. A :class:`ContractError` names the clause that is broken. In a test::
 
     from tofcapture.testing import check_tof
 
     def test_my_camera_keeps_the_contract():
         check_tof(lambda: MyTof({"port": "/dev/ttyUSB0"}, context))
-
-The clauses are in docs/drivers.md.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -25,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from tofcapture.devices.registry import lacking
 from tofcapture.errors import MotionRefused, TofError
-from tofcapture.frames import ArmInfo, ArmState, Truth
+from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth
 from tofcapture.poses import Float64, check_transform
 
 Make = Callable[[], Any]
@@ -33,120 +31,34 @@ Prepare = Callable[[Any], None]
 
 _NEAR = np.radians(0.1)  # rad; a settled arm is this close to its goal
 _NUDGE = 0.02  # rad
+_FAR = 20.0  # m; points beyond are millimetres
 _IO = ("socket.connect", "socket.bind", "subprocess.Popen", "os.posix_spawn", "os.fork", "pty.spawn")
-
-
-class _Watched(threading.local):
-    seen: list[str] | None = None
-
-
-_watched = _Watched()
-_installed = threading.Lock()
-_hooks: list[object] = []
 
 
 class ContractError(AssertionError):
     """A driver breaks the contract; the message is the clause and what was seen."""
 
 
-def require(holds: object, clause: str, seen: object = "") -> None:
-    """Raise the clause, and what was seen, unless it holds."""
-    if not holds:
-        raise ContractError(f"{clause}; got {seen!r}" if seen != "" else clause)
+class _Watched(threading.local):
+    """I/O that this thread does, while it is watched."""
+
+    seen: list[str] | None = None
 
 
-def nothing(device: Any) -> None:
-    """Leave an open device as it is."""
-    del device
+_watched = _Watched()
 
 
-def _hook(event: str, args: tuple[Any, ...]) -> None:
-    seen = _watched.seen
-    if seen is None:
-        return
-    device_file = event == "open" and isinstance(args[0], str) and args[0].startswith("/dev/")
-    if event in _IO or (device_file and args[0] not in {"/dev/null", "/dev/urandom"}):
-        seen.append(f"{event} {args[0]}")
+def check_arm(make: Make, prepare: Prepare = lambda _: None, goal: ArrayLike | None = None) -> None:
+    """Put an arm through the contract.
 
-
-@contextmanager
-def _watching(clause: str) -> Iterator[None]:
-    """Notice I/O of this thread: connections, child processes, device files."""
-    with _installed:
-        if not _hooks:
-            sys.addaudithook(_hook)
-            _hooks.append(_hook)
-    seen: list[str] = []
-    _watched.seen = seen
-    try:
-        yield
-    finally:
-        _watched.seen = None
-    require(not seen, clause, seen)
-
-
-def made(make: Make, role: str) -> Any:
-    """Construct and describe, without I/O; all of the role's protocol must be there."""
-    with _watching("the constructor and describe() do no I/O"):
-        device = make()
-        require(not (missing := lacking(role, device)), f"the device has all of a {role}'s protocol", missing)
-        if role != "operator":
-            device.describe()
-    return device
-
-
-def check_describe(device: Any, kind: type) -> Any:
-    """Describe twice; return what it said."""
-    first, second = device.describe(), device.describe()
-    require(isinstance(first, kind), f"describe() returns a {kind.__name__}", first)
-    require(first.model and isinstance(first.serial, str), "describe() names the model", first)
-    require(repr(first) == repr(second), "describe() says the same each time")
-    return first
-
-
-def _refuses(action: Callable[[], Any], kind: type[TofError], clause: str) -> None:
-    try:
-        action()
-    except kind:
-        return
-    except Exception as err:
-        raise ContractError(f"{clause}; it raised {type(err).__name__}: {err}") from err
-    raise ContractError(clause)
-
-
-def only_named_errors(action: Callable[[], Any], clause: str) -> None:
-    """Do it; anything but success or a TofError breaks the clause."""
-    try:
-        action()
-    except TofError:
-        return
-    except Exception as err:
-        raise ContractError(f"{clause}; it raised {type(err).__name__}: {err}") from err
-
-
-def check_arm(make: Make, prepare: Prepare = nothing, goal: ArrayLike | None = None) -> None:
-    """Put an arm through the contract. It moves: by 0.02 rad in its first joint, or to ``goal`` and back.
-
-    Parameters
-    ----------
-    make
-        Makes a new, unopened arm.
-    prepare
-        Is called with every open arm before it is used.
-    goal
-        (6,) rad, reachable from where the arm stands.
-
-    Raises
-    ------
-    ContractError
-        The clause that is broken.
+    It moves: by 0.02 rad in its first joint, or to ``goal`` (6,) rad, reachable from where it stands, and back.
     """
-    arm = made(make, "arm")
-    check_describe(arm, ArmInfo)
+    arm = _made(make, "arm")
+    _check_describe(arm, ArmInfo)
     _refuses(arm.state, TofError, "state() of an arm that is not open raises a TofError")
     with arm as opened:
         prepare(opened)
-        require(opened is arm, "__enter__ returns the device")
+        _require(opened is arm, "__enter__ returns the device")
         before = _check_state(arm)
         there = before.joints + np.eye(6)[0] * _NUDGE if goal is None else np.asarray(goal, dtype=np.float64)
         _check_moves(arm, before.joints, there)
@@ -161,16 +73,141 @@ def check_arm(make: Make, prepare: Prepare = nothing, goal: ArrayLike | None = N
         _check_state(again)
 
 
+def check_tof(make: Make, prepare: Prepare = lambda _: None, frames: int = 2) -> None:
+    """Put a ToF camera through the contract, with bursts of ``frames`` frames."""
+    camera = _made(make, "tof")
+    info = _check_describe(camera, TofInfo)
+    _only_named_errors(
+        lambda: camera.capture(1), "capture() of a camera that is not open raises TofErrors only"
+    )
+    last = None
+    for _ in range(2):
+        with camera as opened:
+            prepare(opened)
+            _require(opened is camera, "__enter__ returns the device")
+            for _ in range(2):
+                burst = camera.capture(frames)
+                _check_burst(burst, info, frames)
+                first = int(burst.time_ns[0])
+                _require(last is None or first > last, "the frames of a later burst are later")
+                last = int(burst.time_ns[-1])
+            _only_named_errors(partial(camera.capture, -1), "capture(-1) raises TofErrors only")
+        # A device that was closed can be opened again; a new one starts no earlier.
+        camera = make()
+
+
+def check_stereo(make: Make, prepare: Prepare = lambda _: None) -> None:
+    """Put a stereo camera through the contract."""
+    camera = _made(make, "stereo")
+    info = _check_describe(camera, StereoInfo)
+    _only_named_errors(camera.capture, "capture() of a camera that is not open raises TofErrors only")
+    last = None
+    for _ in range(2):
+        with camera as opened:
+            prepare(opened)
+            _require(opened is camera, "__enter__ returns the device")
+            for _ in range(2):
+                frame = camera.capture()
+                _check_points(frame, info)
+                _require(last is None or frame.time_ns > last, "a later point map is later")
+                last = frame.time_ns
+        camera = make()
+
+
+def check_operator(make: Make, scene: str = "mug") -> None:
+    """Put an operator through the contract, with a scene that it can place."""
+    operator = _made(make, "operator")
+    operator.place(scene)
+    operator.place(scene)
+    try:
+        truth = operator.truth()
+    except TofError:
+        return  # knows the truth only of a pose, and there is none yet
+    _require(truth is None or isinstance(truth, Truth), "truth() returns a Truth or None", type(truth))
+
+
+def _require(holds: object, clause: str, seen: object = "") -> None:
+    """Raise the clause, and what was seen, unless it holds."""
+    if not holds:
+        raise ContractError(f"{clause}; got {seen!r}" if seen != "" else clause)
+
+
+def _refuses(action: Callable[[], Any], kind: type[TofError], clause: str) -> None:
+    try:
+        action()
+    except kind:
+        return
+    except Exception as err:
+        raise ContractError(f"{clause}; it raised {type(err).__name__}: {err}") from err
+    raise ContractError(clause)
+
+
+def _only_named_errors(action: Callable[[], Any], clause: str) -> None:
+    """Do it; anything but success or a TofError breaks the clause."""
+    try:
+        action()
+    except TofError:
+        return
+    except Exception as err:
+        raise ContractError(f"{clause}; it raised {type(err).__name__}: {err}") from err
+
+
+def _note_io(event: str, args: tuple[Any, ...]) -> None:
+    if _watched.seen is None:
+        return
+    device_file = event == "open" and isinstance(args[0], str) and args[0].startswith("/dev/")
+    if event in _IO or (device_file and args[0] not in {"/dev/null", "/dev/urandom"}):
+        _watched.seen.append(f"{event} {args[0]}")
+
+
+@cache
+def _install() -> None:
+    """Add the audit hook, once: hooks cannot be removed."""
+    sys.addaudithook(_note_io)
+
+
+@contextmanager
+def _watching(clause: str) -> Iterator[None]:
+    """Notice I/O of this thread: connections, child processes, device files."""
+    _install()
+    seen = _watched.seen = []
+    try:
+        yield
+    finally:
+        _watched.seen = None
+    _require(not seen, clause, seen)
+
+
+def _made(make: Make, role: str) -> Any:
+    """Construct and describe, without I/O; all of the role's protocol must be there."""
+    with _watching("the constructor and describe() do no I/O"):
+        device = make()
+        missing = lacking(role, device)
+        _require(not missing, f"the device has all of the protocol of its role, {role}", missing)
+        if role != "operator":
+            device.describe()
+    return device
+
+
+def _check_describe(device: Any, kind: type) -> Any:
+    """Describe twice; return what it said."""
+    first, second = device.describe(), device.describe()
+    _require(isinstance(first, kind), f"describe() returns a {kind.__name__}", first)
+    _require(first.model and isinstance(first.serial, str), "describe() names the model", first)
+    _require(repr(first) == repr(second), "describe() says the same each time")
+    return first
+
+
 def _check_state(arm: Any) -> ArmState:
     first, second = arm.state(), arm.state()
     for state in (first, second):
-        require(isinstance(state, ArmState), "state() returns an ArmState", state)
-        require(
+        _require(isinstance(state, ArmState), "state() returns an ArmState", state)
+        _require(
             np.shape(state.joints) == (6,) and np.isfinite(state.joints).all(), "joints are 6 finite angles"
         )
         check_transform(state.T_base_flange)
-        require(isinstance(state.time_ns, int), "time_ns is a whole number", state.time_ns)
-    require(second.time_ns > first.time_ns, "the time of a later state is later")
+        _require(isinstance(state.time_ns, int), "time_ns is a whole number", state.time_ns)
+    _require(second.time_ns > first.time_ns, "the time of a later state is later")
     checked: ArmState = second
     return checked
 
@@ -179,9 +216,9 @@ def _check_moves(arm: Any, home: Float64, goal: Float64) -> None:
     for target in (goal, goal, home):
         state = arm.move_to(target)
         off = float(np.abs(state.joints - target).max())
-        require(off < _NEAR, "move_to returns the measured state, settled at the goal", off)
+        _require(off < _NEAR, "move_to returns the measured state, settled at the goal", off)
         now = arm.state()
-        require(np.abs(now.joints - state.joints).max() < _NEAR, "after move_to the arm stays where it is")
+        _require(np.abs(now.joints - state.joints).max() < _NEAR, "after move_to the arm stays where it is")
 
 
 def _check_refusals(arm: Any) -> None:
@@ -193,35 +230,34 @@ def _check_refusals(arm: Any) -> None:
         "an angle of 100 rad": np.full(6, 100.0),
     }
     for what, joints in bad.items():
-        _refuses(
-            partial(arm.move_to, joints),
-            MotionRefused,
-            f"move_to refuses {what} by MotionRefused",
-        )
+        clause = f"move_to refuses {what} by MotionRefused"
+        _refuses(partial(arm.move_to, joints), MotionRefused, clause)
     after = arm.state().joints
-    require(np.abs(after - before).max() < _NEAR, "a refused motion moves nothing")
+    _require(np.abs(after - before).max() < _NEAR, "a refused motion moves nothing")
 
 
-def check_operator(make: Make, scene: str = "mug") -> None:
-    """Put an operator through the contract.
+def _check_burst(burst: Any, info: TofInfo, frames: int) -> None:
+    _require(isinstance(burst, TofBurst), "capture() returns a TofBurst", type(burst))
+    shape = (frames, len(info.modulation_hz), *info.camera.shape)
+    _require(burst.raw.shape == shape, f"raw has the shape {shape} that describe() promises", burst.raw.shape)
+    _require(burst.raw.dtype == np.uint16, "raw is uint16, as the sensor gave it", burst.raw.dtype)
+    _require(burst.time_ns.dtype == np.int64, "time_ns is int64", burst.time_ns.dtype)
+    _require((np.diff(burst.time_ns) > 0).all(), "the times of a burst increase")
+    one_each = burst.celsius.shape == (frames,)
+    _require(one_each, "celsius has one value a frame, NaN for unknown", burst.celsius.shape)
+    _require(repr(burst.info) == repr(info), "the burst carries what describe() says")
 
-    Parameters
-    ----------
-    make
-        Makes a new operator.
-    scene
-        A scene it can place.
 
-    Raises
-    ------
-    ContractError
-        The clause that is broken.
-    """
-    operator = made(make, "operator")
-    operator.place(scene)
-    operator.place(scene)
-    try:
-        truth = operator.truth()
-    except TofError:
-        return  # knows the truth only of a pose, and there is none yet
-    require(truth is None or isinstance(truth, Truth), "truth() returns a Truth or None", type(truth))
+def _check_points(frame: Any, info: StereoInfo) -> None:
+    _require(isinstance(frame, StereoFrame), "capture() returns a StereoFrame", type(frame))
+    _require(frame.points.dtype == np.float32, "points are float32", frame.points.dtype)
+    measured = np.isfinite(frame.points).all(axis=-1)
+    whole = (np.isfinite(frame.points).any(axis=-1) == measured).all()
+    _require(whole, "a point has three numbers or three NaN")
+    _require(not (frame.points[measured] == 0).all(axis=-1).any(), "zero never means missing: NaN does")
+    depths = frame.points[..., 2][measured]
+    _require(depths.size, "the point map of a scene is not empty")
+    _require((depths > 0).all(), "points lie in front of the camera")
+    median = float(np.median(depths))
+    _require(median < _FAR, "points are in metres", median)
+    _require(repr(frame.info) == repr(info), "the frame carries what describe() says")

@@ -24,7 +24,7 @@ from tofcapture.errors import DeviceError, TofError
 
 
 class Child:
-    """What the child process does; ``end`` is its end of the connection."""
+    """The child's work. ``end`` is its end of the connection."""
 
     def __init__(self, end: Connection) -> None:
         self._end = end

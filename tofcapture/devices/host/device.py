@@ -14,40 +14,22 @@ from tofcapture.devices.faults import ArmFault, HostLost
 from tofcapture.devices.host.process import Host
 from tofcapture.devices.registry import StationContext, make_target
 from tofcapture.errors import ConfigError, DeviceError
-from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig
 
 # Seconds; a driver's own deadlines are laid over them.
-DEADLINES = {
-    "__enter__": 12.0,
-    "__exit__": 2.0,
-    "state": 4.0,
-    "stop": 2.0,
-    "move_to": 300.0,
-    "capture": 60.0,
-    "equip": 4.0,
-}
+_DEADLINES = {
+    "__enter__": 12.0, "__exit__": 2.0, "equip": 4.0, "state": 4.0, "stop": 2.0, "move_to": 300.0, "capture": 60.0,
+}  # fmt: skip
 _GUARD = 3.0  # s beyond the deadline of opening; a child whose parent is silent for longer ends itself
 _PAUSES = (0.5, 1.0, 2.0)  # s before the first, second ... new child
 
 
 class HostedDevice(Device):
-    """A driver that lives in a child process; :func:`hosted` makes them.
+    """A driver that lives in a child process; :func:`hosted` makes them and explains their parameters.
 
-    Parameters
-    ----------
-    role
-        For messages.
-    target
-        ``module:name`` of the driver's factory, which takes (table, context). Its constructor does no I/O: it also runs
-        here, to answer ``describe`` and ``probe``.
-    table, context
-        The device's table and its station. What devices share stays here.
-    deadlines
-        Seconds by verb, laid over :data:`DEADLINES`.
-    overdue
-        What it means for this device when a call exceeds its deadline.
+    The driver is also made here, without opening it, to answer ``describe`` and ``probe``. What the devices of a station
+    share stays here.
     """
 
     respawn = 3  # how often a lost child is replaced
@@ -65,7 +47,7 @@ class HostedDevice(Device):
         self._left = self.respawn
         self._local = make_target(target, table, context)
         self._order = {"target": target, "table": dict(table), "context": replace(context, shared={})}
-        self._deadlines = {**DEADLINES, **deadlines}
+        self._deadlines = {**_DEADLINES, **deadlines}
         self._host: Host | None = None
         self._one = threading.Lock()
 
@@ -103,6 +85,10 @@ class HostedDevice(Device):
     def pid(self) -> int | None:
         """Process id of the child, while it is open."""
         return None if self._host is None else self._host.pid
+
+    def describe(self) -> Any:
+        """Say what this device is, without opening it."""
+        return self._local.describe()
 
     def probe(self) -> str:
         """Ask whether the device is there; nothing is opened and no child is started."""
@@ -159,27 +145,20 @@ class HostedArm(HostedDevice, Arm):
 
     @property
     def simulated(self) -> bool:
-        """What the driver says of itself."""
+        """True when the driver says so of itself."""
         return bool(self._local.simulated)
-
-    def describe(self) -> ArmInfo:
-        """Say what this arm is, without opening it."""
-        info: ArmInfo = self._local.describe()
-        return info
 
     def equip(self, rig: Rig) -> None:
         """Tell the arm what it carries, for its checks of the way."""
         self.call("equip", rig)
 
-    def state(self) -> ArmState:
+    def state(self) -> Any:
         """Measure the joints now."""
-        state: ArmState = self.call("state")
-        return state
+        return self.call("state")
 
-    def move_to(self, joints: Float64) -> ArmState:
+    def move_to(self, joints: Float64) -> Any:
         """Move, wait until settled, return the measured state."""
-        state: ArmState = self.call("move_to", joints)
-        return state
+        return self.call("move_to", joints)
 
     def stop(self) -> None:
         """Stop now, also in the middle of a move of another thread.
@@ -198,29 +177,17 @@ class HostedArm(HostedDevice, Arm):
 class HostedTof(HostedDevice, TofCamera):
     """A ToF camera in a child process."""
 
-    def describe(self) -> TofInfo:
-        """Say what this camera is, without opening it."""
-        info: TofInfo = self._local.describe()
-        return info
-
-    def capture(self, frames: int) -> TofBurst:
+    def capture(self, frames: int) -> Any:
         """Take a burst of ``frames`` static frames."""
-        burst: TofBurst = self.call("capture", frames)
-        return burst
+        return self.call("capture", frames)
 
 
 class HostedStereo(HostedDevice, StereoDevice):
     """A stereo camera in a child process."""
 
-    def describe(self) -> StereoInfo:
-        """Say what this camera is, without opening it."""
-        info: StereoInfo = self._local.describe()
-        return info
-
-    def capture(self) -> StereoFrame:
+    def capture(self) -> Any:
         """Take one point map."""
-        frame: StereoFrame = self.call("capture")
-        return frame
+        return self.call("capture")
 
 
 _KINDS: dict[str, type[HostedDevice]] = {"arm": HostedArm, "tof": HostedTof, "stereo": HostedStereo}

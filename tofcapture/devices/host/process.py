@@ -42,9 +42,7 @@ class Host:
         What it means for this device when a call exceeds its deadline.
     """
 
-    def __init__(
-        self, name: str, order: Mapping[str, Any], guard: float, overdue: type[ArmFault] = HostLost
-    ) -> None:
+    def __init__(self, name: str, order: Mapping[str, Any], guard: float, overdue: type[ArmFault]) -> None:
         self._name, self._overdue = name, overdue
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as the child
         self._end, other = Pipe()
@@ -80,16 +78,9 @@ class Host:
         return self._process.pid
 
     def call(self, verb: str, args: tuple[Any, ...], deadline: float, *, quiet: bool = False) -> Any:
-        """Call a method of the driver.
+        """Call a method of the driver; after ``deadline`` seconds the child is killed.
 
-        Parameters
-        ----------
-        verb, args
-            The method.
-        deadline
-            Seconds, after which the child is killed.
-        quiet
-            The call may hold Python's lock, so that signs of life do not count while it runs.
+        With ``quiet`` the call may hold Python's lock, so that signs of life do not count while it runs.
 
         Raises
         ------

@@ -15,19 +15,11 @@ _SPAN_NS = 2_000_000_000  # below this, drift drowns in the round trip's uncerta
 
 @dataclass(frozen=True)
 class Anchor:
-    """Both clocks at one moment.
+    """Both clocks at one moment."""
 
-    Attributes
-    ----------
-    host_ns, module_us
-        Monotonic host clock, module clock.
-    error_ns
-        Bound of the error: half the round trip.
-    """
-
-    host_ns: int
+    host_ns: int  # monotonic
     module_us: int
-    error_ns: int
+    error_ns: int  # bound of the error: half the round trip
 
 
 def anchor(samples: Sequence[tuple[int, int, int]]) -> Anchor:

@@ -71,10 +71,7 @@ class SerialTof(ReopenedCamera, TofCamera):
     def describe(self) -> TofInfo:
         """Say what this camera is, from ``station.toml`` and the description file; opens nothing.
 
-        Raises
-        ------
-        ConfigError
-            The module was never opened and ``station.toml`` does not say everything.
+        Raises ConfigError when the module was never opened and ``station.toml`` does not say everything.
         """
         return self._described(_said_by(self._module) if self._module else read_description(self._file))
 
@@ -99,11 +96,6 @@ class SerialTof(ReopenedCamera, TofCamera):
 
     def capture(self, frames: int) -> TofBurst:
         """Expose a burst into the module's memory, then upload it.
-
-        Parameters
-        ----------
-        frames
-            At least 1, at most what the module's memory holds.
 
         Returns
         -------

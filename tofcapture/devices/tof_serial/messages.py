@@ -18,7 +18,7 @@ class MalformedError(ValueError):
 
 
 class Progress(IntEnum):
-    """Where a burst stands in the module."""
+    """State of a burst in the module."""
 
     NONE = 0
     EXPOSING = 1
@@ -26,7 +26,7 @@ class Progress(IntEnum):
 
 
 class Reason(IntEnum):
-    """Why a module refused."""
+    """Reason of a module's refusal."""
 
     UNKNOWN_KIND = 1
     MALFORMED = 2
@@ -69,48 +69,22 @@ class Body:
 
 @dataclass(frozen=True)
 class Info(Body):
-    """INFO, the answer to HELLO.
+    """INFO, the answer to HELLO."""
 
-    Attributes
-    ----------
-    firmware
-        (major, minor).
-    boot
-        Differs after each start of the module.
-    width, height, bits
-        Pixels of one phase image; 12 or 16 bits per value.
-    frames
-        Frames that the module's memory holds.
-    chunk
-        Largest DATA payload that it sends, bytes.
-    exposure_us
-        Integration time of one phase image.
-    period_us
-        From one frame's start to the next.
-    intrinsics
-        fx, fy, cx, cy in 1/65536 pixel; all zero when the module does not know them.
-    illuminator_um
-        Light source in the camera's frame, micrometres.
-    hz, phase
-        Of each phase image: modulation frequency, and demodulation phase in 1/65536 turn.
-    model, serial
-        ASCII.
-    """
-
-    firmware: tuple[int, int]
-    boot: int
+    firmware: tuple[int, int]  # major, minor
+    boot: int  # differs after each start of the module
     width: int
     height: int
-    bits: int
-    frames: int
-    chunk: int
-    exposure_us: int
-    period_us: int
-    intrinsics: tuple[int, int, int, int]
-    illuminator_um: tuple[int, int, int]
-    hz: tuple[int, ...]
-    phase: tuple[int, ...]
-    model: str
+    bits: int  # of a value: 12 or 16
+    frames: int  # that the module's memory holds
+    chunk: int  # bytes of the largest DATA payload that it sends
+    exposure_us: int  # of one phase image
+    period_us: int  # from one frame's start to the next
+    intrinsics: tuple[int, int, int, int]  # fx, fy, cx, cy in 1/65536 pixel; all zero when unknown
+    illuminator_um: tuple[int, int, int]  # light source in the camera's frame
+    hz: tuple[int, ...]  # modulation frequency of each phase image
+    phase: tuple[int, ...]  # demodulation phase of each, in 1/65536 turn
+    model: str  # ASCII
     serial: str
 
     LAYOUT = struct.Struct("<HHIHHBBHHII4I3i32s16s")
@@ -186,29 +160,15 @@ class FrameKey(Body):
 
 @dataclass(frozen=True)
 class Frame(Body):
-    """FRAME, the answer to META.
-
-    Attributes
-    ----------
-    burst, frame
-        Which.
-    size, crc
-        Bytes of the packed frame, and their CRC-32 before whitening.
-    clock_us
-        Module clock at the start of the exposure.
-    centi_celsius
-        1/100 degree, -32768 when unknown.
-    saturated
-        Number of saturated values.
-    """
+    """FRAME, the answer to META."""
 
     burst: int
     frame: int
-    size: int
-    crc: int
-    clock_us: int
-    centi_celsius: int
-    saturated: int
+    size: int  # bytes of the packed frame
+    crc: int  # CRC-32 of them, before whitening
+    clock_us: int  # module clock at the start of the exposure
+    centi_celsius: int  # -32768 when unknown
+    saturated: int  # number of saturated values
     LAYOUT = struct.Struct("<IHIIQhI")
 
     @property

@@ -30,7 +30,7 @@ _MAX_ENCODED = _MAX_PACKET + _MAX_PACKET // 254 + 1
 
 
 class Kind(IntEnum):
-    """What a packet is; those of the module have the high bit set."""
+    """Kinds of packets. Those of the module have the high bit set."""
 
     HELLO = 0x01
     SYNC = 0x02

@@ -51,12 +51,7 @@ def whiten(data: NDArray[np.uint8], offset: int = 0) -> None:
     The sequence runs through all byte values, so constant stretches of an image give one zero in 256 bytes, and a COBS
     decoder has long blocks to copy.
 
-    Parameters
-    ----------
-    data
-        (N,) uint8.
-    offset
-        Place of the first byte within its frame.
+    ``data`` is (N,) uint8; ``offset`` is the place of its first byte within its frame.
     """
     key = np.roll(_KEY, -(offset % 256))
     whole = data.size // 256 * 256
@@ -72,13 +67,7 @@ def values(data: NDArray[np.uint8], shape: tuple[int, ...], bits: int) -> NDArra
 
 
 class Assembly:
-    """One frame, put together from chunks that come in any order, twice, or not at all.
-
-    Parameters
-    ----------
-    size
-        Bytes of the frame.
-    """
+    """One frame of ``size`` bytes, put together from chunks that come in any order, twice, or not at all."""
 
     def __init__(self, size: int) -> None:
         self._bytes = bytearray(size)

@@ -18,15 +18,7 @@ _READ = 65536
 
 
 class Port:
-    """A port and the parser of what comes from it; may be opened and closed again and again.
-
-    Parameters
-    ----------
-    url
-        Device or pyserial URL.
-    baud
-        Baud rate; USB modules ignore it.
-    """
+    """A port (device or pyserial URL) and the parser of what comes from it; may be opened again and again."""
 
     def __init__(self, url: str, baud: int) -> None:
         self.url, self.baud = url, baud
@@ -70,13 +62,7 @@ class Port:
                 return  # a port that is gone is closed
 
     def run(self, script: Script[T]) -> T:
-        """Run a script to its end and return its result.
-
-        Raises
-        ------
-        LinkLostError
-            The port is gone.
-        """
+        """Run a script to its end and return its result; raises LinkLostError when the port is gone."""
         try:
             ask = next(script)
             while True:
@@ -103,7 +89,7 @@ class Port:
         return Heard(time.monotonic_ns())
 
     def _read(self, seconds: float) -> bytes:
-        """Whatever is there, at the latest after so many seconds; pyserial alone reads a socket byte by byte."""
+        """Read whatever is there, at the latest after so many seconds. Alone, pyserial reads a socket byte by byte."""
         try:
             descriptor = self._serial.fileno()
         except (AttributeError, io.UnsupportedOperation):

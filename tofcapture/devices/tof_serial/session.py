@@ -85,7 +85,7 @@ class Ask:
 
 @dataclass(frozen=True)
 class Heard:
-    """What came, and the host clock (ns) right after."""
+    """Packets that came, and the host clock (ns) right after."""
 
     now: int
     packets: tuple[Packet, ...] = ()

@@ -32,14 +32,9 @@ _PARENT = (2.0, 10.0)  # s of the station's silence that stop a motion, and an i
 
 
 class UrArm(Arm):
-    """A UR arm behind ``ur_rtde``.
+    """A UR arm behind ``ur_rtde``; ``table`` is that of :class:`limits.Settings`.
 
-    Parameters
-    ----------
-    table
-        See :class:`limits.Settings`.
-    context
-        The station; says whether motion is allowed, and where things stand.
+    The station's ``context`` says whether motion is allowed, and where things stand.
     """
 
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
@@ -98,9 +93,9 @@ class UrArm(Arm):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the script on the controller. The library's own farewell is left out: it crashes after a lost link.
+        """End the script on the controller.
 
-        The process is not needed after this; the library's objects stay, for their destructors hang and crash too.
+        The library's own farewell is left out: it crashes after a lost link, and its destructors hang. The process ends.
         """
         self._closed.set()
         if self._link is not None and self._link.playing and self._link.trouble() is None:

@@ -20,69 +20,38 @@ _STEP = np.radians(2.0)  # between checks of the way
 _RADIUS = 0.08  # m; of the arm's links and the rig, by which keep-outs grow
 
 _RANGES = {
-    "speed": (0.01, 1.05),
-    "acceleration": (0.05, 1.4),
-    "max_step_deg": (1.0, 360.0),
-    "watchdog_hz": (1.0, 10.0),
-    "settle": (0.0, 5.0),
-    "payload": (0.0, 30.0),
-}
+    "speed": (0.01, 1.05), "acceleration": (0.05, 1.4), "max_step_deg": (1.0, 360.0), "watchdog_hz": (1.0, 10.0),
+    "settle": (0.0, 5.0), "payload": (0.0, 30.0),
+}  # fmt: skip
 _TEXTS = ("model", "host", "serial", "pose")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How the arm is reached and how it moves.
+    """Address of the arm, and limits of its motion.
 
-    Attributes
-    ----------
-    model
-        Kinematics for the checks of the way.
-    host
-        Address of the controller.
-    serial
-        Expected serial number of the arm; empty for any.
-    speed, acceleration
-        Of joints, rad/s and rad/s^2.
-    max_step_deg
-        Largest turn of one joint in one motion: a change of the kinematic branch is larger.
-    watchdog_hz
-        The controller stops the program when it hears less often from us.
-    settle
-        Seconds of ringing after the arm is measured at rest.
-    payload
-        Expected payload, kg; NaN for any.
-    pose
-        ``controller``: the flange's pose is the controller's own, with the arm's calibration in it. ``joints``: nominal
-        kinematics of the measured joints.
-    workspace
-        (2, 3) corners of the box, base frame, m, that flange and cameras stay in; ``None`` for everywhere.
-    keep_out
-        (N, 2, 3) corners of boxes that nothing may enter.
+    ``pose`` says where the flange's pose comes from: the ``controller``, with the arm's calibration in it, or nominal
+    kinematics of the measured ``joints``. Boxes are two corners each, base frame, metres.
     """
 
-    model: ArmModel
-    host: str
-    serial: str = ""
-    speed: float = 0.5
-    acceleration: float = 0.5
-    max_step_deg: float = 150.0
-    watchdog_hz: float = 2.0
-    settle: float = 0.3
-    payload: float = float("nan")
+    model: ArmModel  # kinematics for the checks of the way
+    host: str  # address of the controller
+    serial: str = ""  # expected serial number of the arm; empty for any
+    speed: float = 0.5  # of joints, rad/s
+    acceleration: float = 0.5  # rad/s^2
+    max_step_deg: float = (
+        150.0  # largest turn of a joint in one motion: a change of the kinematic branch is larger
+    )
+    watchdog_hz: float = 2.0  # the controller stops the program when it hears less often from us
+    settle: float = 0.3  # s of ringing after the arm is measured at rest
+    payload: float = float("nan")  # expected, kg; NaN for any
     pose: str = "controller"
-    workspace: Float64 | None = None
-    keep_out: Float64 = field(default_factory=lambda: np.empty((0, 2, 3)))
+    workspace: Float64 | None = None  # (2, 3): flange and cameras stay in this box; None for everywhere
+    keep_out: Float64 = field(default_factory=lambda: np.empty((0, 2, 3)))  # (N, 2, 3): nothing enters these
 
 
 def read_settings(table: Mapping[str, Any]) -> Settings:
-    """Check the ``[arm]`` table.
-
-    Raises
-    ------
-    ConfigError
-        Unknown keys, no host, values out of range.
-    """
+    """Check the ``[arm]`` table; raises ConfigError for unknown keys, no host, and values out of range."""
     check_keys(table, (*_TEXTS, *_RANGES, "workspace", "keep_out"), "[arm]")
     texts = {key: str(table[key]) for key in _TEXTS if key in table}
     if not texts.get("host"):

@@ -10,7 +10,6 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,36 +32,17 @@ _VARIABLES = (
 
 @dataclass(frozen=True)
 class Sample:
-    """One reading.
+    """One reading."""
 
-    Attributes
-    ----------
-    timestamp
-        Controller's clock, s.
-    joints, speeds
-        (6,) rad, rad/s, measured.
-    pose
-        (6,) m and rad, of the active TCP.
-    scaling
-        Speed slider, 0 to 1.
-    """
-
-    timestamp: float
-    joints: Float64
-    speeds: Float64
-    pose: Float64
-    scaling: float
+    timestamp: float  # controller's clock, s
+    joints: Float64  # (6,) measured, rad
+    speeds: Float64  # (6,) measured, rad/s
+    pose: Float64  # (6,) of the active TCP, m and rad
+    scaling: float  # speed slider, 0 to 1
 
 
 class Link:
-    """Both connections of the library to one controller.
-
-    Parameters
-    ----------
-    host
-        Address.
-    scaling
-        The controller reports what the speed slider does.
+    """Both connections of the library to the controller at ``host``; with ``scaling`` it reports its speed slider.
 
     Raises
     ------
@@ -137,33 +117,21 @@ class Link:
         return faults.ProgramStopped(f"{self._host}: the controller refused {refused} and gives no reason")
 
     def sample(self) -> Sample:
-        """Read what the controller says, after making sure that it may be believed.
-
-        Raises
-        ------
-        ArmFault
-            Anything of :meth:`trouble`, or values that are no numbers.
-        """
+        """Read what the controller says; raises ArmFault for :meth:`trouble`, and for values that are no numbers."""
         if (fault := self.trouble()) is not None:
             raise fault
         receive = self._receive
         stamp = float(receive.getTimestamp())
         scaling = float(receive.getSpeedScaling()) if self._scaling else 1.0
-        joints, speeds = _array(receive.getActualQ()), _array(receive.getActualQd())
-        pose = _array(receive.getActualTCPPose())
+        measured = receive.getActualQ(), receive.getActualQd(), receive.getActualTCPPose()
+        joints, speeds, pose = (np.array(values, dtype=np.float64) for values in measured)
         if not all(a.shape == (6,) and np.isfinite(a).all() for a in (joints, speeds, pose)):
             raise faults.StaleData(f"{self._host}: the measured joints are no numbers: {joints.tolist()}")
         # A controller at rest may say 0: the slider is not at zero while a program plays.
         return Sample(stamp, joints, speeds, pose, scaling if 0.01 <= scaling <= 1 else 1.0)
 
     def fresh(self) -> Sample:
-        """Wait for a sample that was measured after this call: the second new one.
-
-        Raises
-        ------
-        ArmFault
-            See :meth:`sample`.
-        """
+        """Wait for a sample that was measured after this call: the second new one."""
         stamps = {self._receive.getTimestamp()}
         while True:
             sample = self.sample()
@@ -206,7 +174,7 @@ def _connect(host: str, variables: list[str]) -> tuple[Any, Any]:
 
 
 def _translated(host: str, text: str) -> faults.ArmFault:
-    """The library's sentences, as states."""
+    """Turn the library's sentences into states."""
     if "already in use" in text:
         return faults.NotReady(
             f"{host}: another client commands the controller: {text}",
@@ -217,7 +185,3 @@ def _translated(host: str, text: str) -> faults.ArmFault:
     if "control script" in text:
         return faults.ProgramStopped(f"{host}: {text}")
     return faults.ControllerSilent(f"{host}: {text}")
-
-
-def _array(values: Sequence[float]) -> Float64:
-    return np.array(values, dtype=np.float64)

@@ -27,27 +27,12 @@ _WANTED = ("payload", "tcp_offset", "speed_scaling")
 
 @dataclass(frozen=True)
 class Controller:
-    """What the probe found.
+    """Findings of the probe. ``None`` is what the controller does not say."""
 
-    Attributes
-    ----------
-    version
-        PolyScope's version: major, minor, bugfix, build.
-    serial
-        Of the arm; empty when the dashboard does not say.
-    tcp_offset
-        (6,) m and rad from the flange; ``None`` when the controller does not say.
-    payload
-        kg; ``None`` when the controller does not say.
-    scaling
-        It reports the speed slider's effect.
-    """
-
-    version: tuple[int, ...]
-    serial: str
-    tcp_offset: tuple[float, ...] | None
-    payload: float | None
-    scaling: bool
+    version: tuple[int, ...]  # of PolyScope: major, minor, bugfix, build
+    serial: str  # of the arm; empty when the dashboard does not say
+    tcp_offset: tuple[float, ...] | None  # (6,) m and rad from the flange
+    scaling: bool  # it reports the speed slider's effect
 
 
 def probe(settings: Settings) -> Controller:
@@ -78,18 +63,13 @@ def probe(settings: Settings) -> Controller:
     if fault is not None:
         raise fault
     serial = _dashboard(settings)
-    payload = second.get("payload")
-    _check_payload(settings, payload)  # type: ignore[arg-type]
-    return Controller(version, serial, second.get("tcp_offset"), payload, "speed_scaling" in second)  # type: ignore[arg-type]
-
-
-def _check_payload(settings: Settings, payload: float | None) -> None:
-    # NaN, for any payload, compares false.
-    if payload is not None and abs(payload - settings.payload) > 0.05:
+    payload = second.get("payload", float("nan"))
+    if abs(payload - settings.payload) > 0.05:  # type: ignore[operator]  # NaN, for any payload, compares false
         raise NotReady(
             f"expected a payload of {settings.payload} kg, the controller has {payload:.2f} kg",
             hint="set payload and centre of gravity on the pendant, or correct [arm] payload",
         )
+    return Controller(version, serial, second.get("tcp_offset"), "speed_scaling" in second)  # type: ignore[arg-type]
 
 
 def _dashboard(settings: Settings) -> str:
