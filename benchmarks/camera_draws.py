@@ -20,10 +20,10 @@ import torch
 from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.world import factory_calibration
 from tofcapture.rig import RangeError
-from tofcapture_model.data.frames import FrameDataset, batched, frame_decoder, make_frame
-from tofcapture_model.networks.baselines import sensor
+from tofcapture_model.data import FrameDataset, batched, frame_decoder, make_frame
+from tofcapture_model.networks.baselines import sensor_estimate
+from tofcapture_model.networks.checkpoint import load_model
 from tofcapture_model.networks.joint import JointModel
-from tofcapture_model.training.checkpoint import load_model
 
 SEED = 900_000  # far from those of any data
 
@@ -38,7 +38,7 @@ def measured(data: FrameDataset, model: JointModel, every: int, errors: tuple[Ra
         raw, celsius = reader.raw(view.view, view.frame), reader.celsius(view.view, view.frame)
         frame = batched(make_frame(raw, info, reader.camera, celsius, decoder))
         with torch.inference_mode():
-            found, decoded = model(frame), sensor.estimate(frame)[0]
+            found, decoded = model(frame), sensor_estimate(frame)[0]
         apart = (found.depth[0] - target.depth).abs()[target.good]
         ours.append(apart.numpy())
         theirs.append((decoded[0] - target.depth).abs()[target.good].numpy())

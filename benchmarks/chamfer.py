@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from tofcapture_model.geometry.maps import unproject
-from tofcapture_model.losses.chamfer.robust import candidate_shifts, robust_chamfer
+from tofcapture_model.losses.chamfer import candidate_shifts, robust_chamfer
 
 K = torch.tensor([[381.2, 401.5, 234.2, 203.5]])
 SHAPE = (360, 480)
@@ -156,7 +156,7 @@ def main() -> None:
 
         def grid(start=start, mask=mask, q=q):
             depth = start.to(args.device).clone().requires_grad_()
-            return depth, robust_chamfer(unproject(depth, k), q, mask, mask, k).loss.sum()
+            return depth, robust_chamfer(unproject(depth, k), q, mask, mask).loss.sum()
 
         def peer(start=start, mask=mask, q=q):
             depth = start.to(args.device).clone().requires_grad_()

@@ -20,7 +20,7 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
-from torch.utils.data import BatchSampler, DataLoader, Dataset, RandomSampler, TensorDataset
+from torch.utils.data import DataLoader, Dataset, RandomSampler, TensorDataset
 
 from tofcapture.camera import Camera
 from tofcapture.files.cache import open_cache, pack
@@ -31,7 +31,7 @@ from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.ops.normals import normals_from_depth
 from tofcapture.ops.phase import ambiguity, frequencies, radial_to_range, taps
 from tofcapture.rig import Rig
-from tofcapture_model.data.shards import ShardDataset
+from tofcapture_model.data import open_scenes
 
 TOF = Camera(240, 180, 190.6, 200.8, 116.8, 101.5)
 STEREO = Camera(1280, 1024, 1400.0, 1400.0, 639.5, 511.5)
@@ -105,12 +105,34 @@ def rates(readers: dict[str, Callable[[int], object]], count: int, seconds: floa
     return best
 
 
+class Samples(Dataset[list[torch.Tensor]]):
+    """What training reads: one raw frame and its view's ground truth, of shards or of a cache."""
+
+    def __init__(self, folder: Path, split: str, cache: Path | None = None) -> None:
+        self.readers = open_scenes(folder, split, cache)
+        self.samples = [
+            (name, view, frame)
+            for name, reader in self.readers.items()
+            for view in range(reader.views)
+            for frame in range(reader.frames)
+        ]
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, i: int) -> list[torch.Tensor]:
+        name, view, frame = self.samples[i]
+        reader = self.readers[name]
+        gt = reader.ground_truth(view, 2)
+        return [torch.from_numpy(a.copy()) for a in (reader.raw(view, frame), gt.depth, gt.normals, gt.mask)]
+
+
 class UncompressedShards:
     """The same chunks, neither compressed nor checked."""
 
     names = ("tof/raw", "gt/depth_2x", "gt/normals_2x", "gt/mask_2x")
 
-    def __init__(self, data: ShardDataset, path: Path) -> None:
+    def __init__(self, data: Samples, path: Path) -> None:
         with h5py.File(path, "w") as out:
             for reader in data.readers.values():
                 with h5py.File(reader.path) as source:
@@ -121,12 +143,12 @@ class UncompressedShards:
         self.sets = {s: [file[f"{s}/{name}"] for name in self.names] for s in data.readers}
 
     def __getitem__(self, i: int) -> list[np.ndarray]:
-        sample = self.samples[i]
-        raw, *maps = self.sets[sample.scene]
-        return [raw[sample.view, sample.frame], *(d[sample.view] for d in maps)]
+        name, view, frame = self.samples[i]
+        raw, *maps = self.sets[name]
+        return [raw[view, frame], *(d[view] for d in maps)]
 
 
-def tensors(data: ShardDataset) -> TensorDataset:
+def tensors(data: Samples) -> TensorDataset:
     """All samples in memory, ground truth repeated for every frame: the plain PyTorch peer."""
     return TensorDataset(*(torch.stack(x) for x in zip(*(data[i] for i in range(len(data))), strict=True)))
 
@@ -140,11 +162,7 @@ def processor_time(pids: list[int]) -> float:
 def loader_rate(data: Dataset[Any], seconds: float) -> tuple[float, float]:
     """Samples per second that arrive from two workers, and the CPU of all three processes for one, in seconds."""
     sampler = RandomSampler(data, replacement=True, num_samples=1 << 20)  # type: ignore[arg-type]
-    # Batches by list of indices where the dataset takes them, item by item where not.
-    how: dict[str, Any] = {"batch_size": BATCH, "sampler": sampler}
-    if isinstance(data, ShardDataset):
-        how = {"batch_size": None, "sampler": BatchSampler(sampler, BATCH, drop_last=True)}
-    loader = DataLoader(data, num_workers=WORKERS, multiprocessing_context="spawn", **how)
+    loader = DataLoader(data, BATCH, sampler=sampler, num_workers=WORKERS, multiprocessing_context="spawn")
     batches: Any = iter(loader)
     for _ in range(4 * WORKERS):
         next(batches)
@@ -210,8 +228,8 @@ def main() -> None:
         start = time.process_time()
         pack(dataset, args.split, folder / "cache")
         packing = time.process_time() - start
-        shards = ShardDataset(dataset, args.split)
-        cached = ShardDataset(dataset, args.split, folder / "cache")
+        shards = Samples(dataset, args.split)
+        cached = Samples(dataset, args.split, folder / "cache")
         in_memory = tensors(cached)
         plain = UncompressedShards(shards, folder / "plain.h5")
         size = sum(x.nbytes for x in cached[0])

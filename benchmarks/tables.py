@@ -13,12 +13,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from tofcapture.cli.kit import Report, progress
 from tofcapture_model.config import BASELINES, OURS, Config, Training, preset
-from tofcapture_model.training.progress import Report, progress
 
 
 def recipes() -> dict[str, dict[str, Config]]:
@@ -106,8 +106,8 @@ def _arguments() -> argparse.Namespace:
     return args
 
 
-def _titled(run: str, report: Report) -> Callable[[str, float, str], None]:
-    return lambda what, fraction, text: report(f"{run} {what}", fraction, text)
+def _titled(run: str, report: Report) -> Report:
+    return lambda what, done, total, text="": report(f"{run} {what}", done, total, text)
 
 
 def _train_all(args: argparse.Namespace, wanted: Mapping[str, Config]) -> dict[str, list[Path]]:
@@ -155,7 +155,7 @@ def main() -> None:
             frames=args.frames,
             device=args.device,
             kept=args.out / "results.runs.json",
-            progress=lambda done, total: report("measure", done / total),
+            progress=lambda done, total: report("measure", done, total),
         )
     for suite in args.suite:
         names = {*FREE, *recipes()[suite], *(added if suite == "main" else ())}

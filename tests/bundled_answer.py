@@ -12,9 +12,9 @@ import torch
 
 from tests.test_model_predict import table_top
 from tofcapture.frames import TofInfo
-from tofcapture_model.data.frames import batched, make_frame
+from tofcapture_model.data import batched, make_frame
 from tofcapture_model.data.raw_input import NOMINAL_CAMERA
-from tofcapture_model.training.checkpoint import load_model
+from tofcapture_model.networks.checkpoint import load_model
 
 KEPT = Path(__file__).with_suffix(".npz")
 EVERY = 20  # pixels

@@ -17,7 +17,7 @@ from tofcapture.files.manifest import load_manifest
 from tofcapture_model.config import loads_config, preset
 from tofcapture_model.evaluation.suite import run_suite
 from tofcapture_model.inference.export import example
-from tofcapture_model.training.checkpoint import find_model, load_model
+from tofcapture_model.networks.checkpoint import find_model, load_model
 
 CARD = files("tofcapture_model") / "weights" / "MODEL_CARD.md"
 LARGEST = 16 * 2**20  # bytes

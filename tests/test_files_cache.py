@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import BatchSampler, DataLoader, RandomSampler, SequentialSampler
+from torch.utils.data import DataLoader
 
 from tests.test_files_shard import write
 from tofcapture.cli import main
@@ -19,7 +19,7 @@ from tofcapture.files import cache as packing
 from tofcapture.files.cache import open_cache, pack, verify_cache
 from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
 from tofcapture.files.shard import ShardReader
-from tofcapture_model.data.shards import ShardDataset
+from tofcapture_model.data import FrameDataset
 
 
 def make(folder, scenes=("box", "mug"), split="train"):
@@ -94,11 +94,11 @@ def test_a_stale_cache_is_refused_and_brought_up_to_date(dataset, tmp_path):
     pack(dataset, "train", cache)
     make(dataset, ("mug", "gear"))
     with pytest.raises(DataError, match=r"stale: box, gear, mug changed") as info:
-        ShardDataset(dataset, "train", cache)
+        FrameDataset(dataset, "train", cache=cache)
     assert "tofcapture pack" in info.value.hint
     assert list(pack(dataset, "train", cache)) == ["gear", "mug"]
     assert sorted(p.name for p in cache.iterdir()) == ["gear.bin", "index.json", "mug.bin"]
-    assert len(ShardDataset(dataset, "train", cache)) == 12
+    assert len(FrameDataset(dataset, "train", cache=cache)) == 12
 
 
 def test_damage_is_named(dataset, tmp_path):
@@ -145,56 +145,27 @@ def test_the_command_packs(dataset, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_items_are_frames_with_their_truth(dataset, tmp_path, packed):
-    """Shards and cache give the same items; an item is nobody else's memory; a list of indices is a batch of them."""
-    cache = tmp_path / "cache"
-    if packed:
-        pack(dataset, "train", cache)
-    data = ShardDataset(dataset, "train", cache if packed else None)
+def test_training_reads_the_same_samples_in_spawned_workers(dataset, tmp_path, packed):
+    """A dataset in use pickles; spawned workers give every frame, in order, of shards and of a cache."""
+    cache = pack(dataset, "train", tmp_path / "cache") and tmp_path / "cache"
+    data = FrameDataset(dataset, "train", cache=cache if packed else None)
     assert len(data) == 12
-    item = data[10]
+    assert len(FrameDataset(dataset, "train", cache=cache if packed else None, frames=1)) == 4
     with ShardReader(dataset / "shards/mug.h5") as shard:
-        np.testing.assert_array_equal(item.raw.numpy(), shard.raw(1, 1))
-        np.testing.assert_array_equal(item.normals.numpy(), shard.ground_truth(1, 2).normals)
-        assert item.celsius == shard.celsius(1, 1)
-    kept = item.raw.clone()
-    item.raw.zero_()
-    batch = data[[10, 3]]
-    assert torch.equal(batch.raw[0], kept)
-    assert batch.raw.dtype == torch.uint16
-    assert torch.equal(torch.nan_to_num(batch.depth[1]), torch.nan_to_num(data[3].depth))
-    assert len(ShardDataset(dataset, "train", cache if packed else None, frames=1)) == 4
-    data.close()
-    assert torch.equal(data[10].raw, kept)
-    data.close()
-
-
-class Both(torch.utils.data.Dataset):
-    """The same frames from shards and from a cache."""
-
-    def __init__(self, *parts):
-        self.parts = parts
-
-    def __getitem__(self, indices):
-        return [part[indices] for part in self.parts]
-
-
-def test_spawned_workers_read_for_themselves(dataset, tmp_path):
-    """A dataset in use pickles; spawned workers give every frame once, as batches, in order, from shards and cache."""
-    pack(dataset, "train", tmp_path / "cache")
-    shards, cached = ShardDataset(dataset, "train"), ShardDataset(dataset, "train", tmp_path / "cache")
-    expected = torch.stack([shards[i].raw.int() for i in range(12)])
-    assert torch.equal(pickle.loads(pickle.dumps(shards))[4].raw.int(), expected[4])  # noqa: S301
+        raw = data[(0, 10)][0].raw * shard.info.saturation
+        np.testing.assert_allclose(raw, shard.raw(1, 1), rtol=1e-6)
+    expected = [data[(0, i)] for i in range(12)]
+    again = pickle.loads(pickle.dumps(data))  # noqa: S301
     loader = DataLoader(
-        Both(shards, cached),
-        batch_size=None,
-        sampler=BatchSampler(SequentialSampler(shards), 5, drop_last=False),
+        again,
+        batch_sampler=[[(0, i) for i in range(k, k + 4)] for k in (0, 4, 8)],
+        collate_fn=list,
         num_workers=1,
         multiprocessing_context=multiprocessing.get_context("spawn"),
     )
-    batches = list(loader)
-    for part in (0, 1):
-        assert torch.equal(torch.cat([batch[part].raw.int() for batch in batches]), expected)
-    plain = DataLoader(cached, batch_size=4, sampler=RandomSampler(cached))
-    assert sum(len(batch.raw) for batch in plain) == 12
-    shards.close()
+    found = [item for batch in loader for item in batch]
+    for a, b in zip(expected, found, strict=True):
+        assert all(torch.equal(x, y) for x, y in zip((*a[0], *a[1]), (*b[0], *b[1]), strict=True))
+    data.close()
+    assert torch.equal(data[(0, 3)][0].raw, expected[3][0].raw)
+    data.close()

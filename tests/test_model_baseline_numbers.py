@@ -13,12 +13,11 @@ from torch.nn import functional as F  # noqa: N812
 from tests.test_model_baselines import target
 from tests.test_model_inputs import slanted
 from tests.test_model_networks import frame
-from tofcapture_model.data.frame import Estimate
 from tofcapture_model.evaluation.metrics import angles_deg
-from tofcapture_model.networks.baselines import lf2
+from tofcapture_model.frame import Estimate
+from tofcapture_model.networks.baselines import Baseline, lf2
 from tofcapture_model.networks.baselines.coarse_fine import CoarseFine, mpi_features
 from tofcapture_model.networks.baselines.guo2018 import MRM
-from tofcapture_model.networks.baselines.protocol import Baseline
 from tofcapture_model.networks.baselines.su2018 import FAR, START, TV, ToFNet, weighted_variation
 
 

@@ -14,16 +14,13 @@ from tests.test_model_networks import frame
 from tofcapture.errors import ConfigError
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.config import BASELINES, Config, Losses, Stage, loads_config, preset
-from tofcapture_model.data.frame import Target
+from tofcapture_model.frame import Target
 from tofcapture_model.geometry.intrinsics import rays
 from tofcapture_model.geometry.maps import metres_per_radian, turn
-from tofcapture_model.networks.baselines import lf2
+from tofcapture_model.networks import build_model, select_stage, training_loss
+from tofcapture_model.networks.baselines import Baseline, decode, lf2, upsample_depth
 from tofcapture_model.networks.baselines.coarse_fine import CoarseFine
-from tofcapture_model.networks.baselines.decoding import decode
 from tofcapture_model.networks.baselines.guo2018 import MRM
-from tofcapture_model.networks.baselines.protocol import Baseline
-from tofcapture_model.networks.baselines.sensor import upsample_depth
-from tofcapture_model.networks.zoo import build_model, select_stage, training_loss
 
 
 def target(data):

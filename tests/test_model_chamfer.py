@@ -1,139 +1,212 @@
-"""The robust Chamfer loss against a k-d tree, and what its seven candidates do and do not supervise."""
+"""The robust Chamfer loss: each engine against brute force in float64, and what its seven candidates do and do not supervise."""
 
 # ruff: noqa: E402  torch is optional
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 torch = pytest.importorskip("torch")
 
-from tofcapture_model.geometry.maps import unproject
-from tofcapture_model.losses.chamfer.neighbours import nearest
-from tofcapture_model.losses.chamfer.robust import candidate_shifts, robust_chamfer
+from tofcapture_model.geometry.maps import depth_to_normals, unproject
+from tofcapture_model.losses.chamfer import candidate_shifts, neighbours, robust_chamfer
 
-K = torch.tensor([[60.0, 60.0, 23.5, 17.5]])
-SHAPE = (36, 48)
+K = torch.tensor([[40.0, 43.0, 11.5, 8.5]])
+SHIFTS = candidate_shifts()
+SURFACES = ("smooth", "jumbled", "stepped", "flat", "apart", "off their rays")
+MASKS = ("full", "sparse", "holes", "one pixel", "corner")
+SHAPES = ((1, 1), (3, 29), (19, 23), (35, 50), (70, 66))
 
 
-def surface(seed=0):
-    """A bumpy depth map, and a mask with holes."""
+def masked(kind, shape, rng):
+    """A mask (H, W) that is not empty."""
+    mask = np.zeros(shape, bool)
+    if kind == "full":
+        mask[:] = True
+    elif kind == "corner":
+        mask[: shape[0] // 3 + 1, : shape[1] // 4 + 1] = True
+    elif kind in {"sparse", "holes"}:
+        mask = rng.random(shape) < (0.05 if kind == "sparse" else 0.8)
+    mask[rng.integers(shape[0]), rng.integers(shape[1])] = True
+    return torch.tensor(mask)
+
+
+def cloud(kind, shape, rng):
+    """Points (3, H, W), metres."""
+    v, u = np.mgrid[0 : shape[0], 0 : shape[1]]
+    depth = 0.8 + 0.002 * u + 0.03 * np.sin(v / 3) + rng.normal(0, 0.001, shape)
+    if kind == "jumbled":
+        depth = rng.uniform(0.2, 3.0, shape)
+    elif kind == "stepped":
+        depth = np.where((u // 7 + v // 5) % 2 == 0, depth, depth - 0.3)
+    elif kind == "flat":
+        depth = np.full(shape, 0.8)
+    points = unproject(torch.tensor(depth, dtype=torch.float32)[None, None], K)[0]
+    off = torch.tensor(
+        rng.normal(0, 0.002 if kind == "off their rays" else 0, points.shape), dtype=torch.float32
+    )
+    return points + off + (0.06 if kind == "apart" else 0.0)
+
+
+def pair(surface, mask, shape, seed=0):
+    """Clouds p, q (3, H, W) and masks (H, W)."""
     rng = np.random.default_rng(seed)
-    v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
-    depth = 0.8 + 0.05 * np.sin(u / 7) * np.cos(v / 5) + rng.normal(0, 0.002, SHAPE)
-    mask = rng.random(SHAPE) > 0.1
-    return torch.tensor(depth, dtype=torch.float32)[None, None], torch.tensor(mask)[None, None]
+    return *(cloud(surface, shape, rng) for _ in "pq"), *(masked(mask, shape, rng) for _ in "pq")
 
 
-def oracle(p, q, p_mask, q_mask, shift):
-    """Mean squared nearest-neighbour distance both ways with a k-d tree."""
-    a = p[0].permute(1, 2, 0)[p_mask[0, 0]].double().numpy() + shift
-    b = q[0].permute(1, 2, 0)[q_mask[0, 0]].double().numpy()
-    return (cKDTree(b).query(a)[0] ** 2).mean() + (cKDTree(a).query(b)[0] ** 2).mean()
+def brute(p, q, p_mask, q_mask, shift):
+    """Squared distances of all pairs (N, M), float64."""
+    a, b = (c.detach().double().numpy()[:, m.numpy()].T for c, m in ((p, p_mask), (q, q_mask)))
+    return (((a + shift.double().numpy())[:, None] - b[None]) ** 2).sum(-1)
 
 
-def test_grid_search_agrees_with_a_kd_tree_for_all_candidates():
-    """The windowed search finds the same seven distances as an exact search in space."""
-    (dp, mp), (dq, mq) = surface(0), surface(1)
-    p, q = unproject(dp + 0.004, K), unproject(dq, K)
-    found = nearest(p[0], q[0], mp[0, 0], mq[0, 0], K[0], candidate_shifts())
-    truth = [oracle(p, q, mp, mq, shift) for shift in candidate_shifts().numpy()]
-    for one, expected in zip(found, truth, strict=True):
-        mean = one.squared[0][mp[0, 0]].mean() + one.squared[1][mq[0, 0]].mean()
-        assert mean.item() == pytest.approx(expected, rel=1e-5)
-    best = robust_chamfer(p, q, mp, mq, K)
-    assert best.loss.item() == pytest.approx(min(truth), rel=1e-5)
-    assert best.winner.item() == truth.index(min(truth))
-    assert all(low <= high * (1 + 1e-5) for low, high in zip(best.candidates[0].tolist(), truth, strict=True))
+def check(engine, clouds, device="cpu"):
+    """Every least distance to 1e-6 of brute force in float64, but for float32's resolution of a metre; whose it is."""
+    found = engine.nearest(*(x.to(device) for x in (*clouds, SHIFTS)))
+    for k, shift in enumerate(SHIFTS):
+        table = brute(*clouds, shift)
+        for way, (mask, other) in enumerate(((clouds[2], clouds[3]), (clouds[3], clouds[2]))):
+            truth = table if way == 0 else table.T
+            least, index = (x[k, way].cpu()[mask].numpy() for x in found)
+            tolerance = 1e-6 * truth.min(1) + 2e-7 * np.sqrt(truth.min(1)) + 1e-13
+            assert (abs(least - truth.min(1)) <= tolerance).all()
+            assert other.flatten()[index].all()
+            number = np.cumsum(other.flatten().numpy()) - 1
+            assert (abs(truth[np.arange(len(truth)), number[index]] - truth.min(1)) <= tolerance).all()
 
 
-def brute(p, q, p_mask, q_mask, jitter=0.01):
-    """Loss and winner by comparing every point with every other."""
-    a, b = p[0][:, p_mask[0, 0]].T, q[0][:, q_mask[0, 0]].T
-    losses = []
-    for s in candidate_shifts(jitter):
-        with torch.no_grad():
-            apart = ((a + s)[:, None] - b[None]).square().sum(-1)
-            to_q, to_p = apart.argmin(1), apart.argmin(0)
-        losses.append((a + s - b[to_q]).square().sum(1).mean() + (a[to_p] + s - b).square().sum(1).mean())
-    return min(losses)
+@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("mask", MASKS)
+def test_the_trees_find_the_nearest(surface, mask):
+    """Steps, noise, holes, single pixels, points off their rays, far clouds; images of any size."""
+    trees = pytest.importorskip("tofcapture_model.losses.chamfer.trees")
+    for seed, shape in enumerate(SHAPES[:4] if mask == "full" else SHAPES):
+        check(trees, pair(surface, mask, shape, seed))
 
 
-def jumbled(seed):
-    """Random depths, 0.2 to 3 m, pixel by pixel: no neighbour is near on the grid."""
-    g = torch.Generator().manual_seed(seed)
-    return 0.2 + 2.8 * torch.rand(1, 1, *SHAPE, generator=g), torch.rand(1, 1, *SHAPE, generator=g) > 0.3
+def test_brute_force_in_torch_is_brute_force():
+    """What runs where no engine does."""
+    for surface in SURFACES:
+        check(neighbours, pair(surface, "holes", (19, 23)))
 
 
-def stepped(seed):
-    """A bumpy surface with a box in front of it, whose edges fly, and a mask of the box and a part of the rest."""
-    depth, mask = surface(seed)
-    depth[..., 10:25, 12:30] -= 0.2
-    depth = torch.nn.functional.avg_pool2d(depth, 3, 1, 1, count_include_pad=False)
-    mask[..., :4] = False
-    return depth, mask
+def test_the_interpreted_kernel_finds_the_nearest():
+    """The search for GPUs by Triton's interpreter; Triton has to be told before it is imported."""
+    pytest.importorskip("triton", reason="Triton comes with PyTorch's wheels for GPUs")
+    env = {**os.environ, "TRITON_INTERPRET": "1"}
+    done = subprocess.run(
+        [sys.executable, __file__], env=env, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.split("\n")[:-1] == list(SURFACES)
 
 
-@pytest.mark.parametrize("pair", ["jumbled", "stepped", "apart"])
-def test_values_and_gradients_are_those_of_brute_force(pair):
-    """To 1e-5, on random depths, across depth steps and between surfaces that are further apart than any window."""
-    make = jumbled if pair == "jumbled" else stepped
-    (start, mp), (dq, mq) = make(0), make(1)
-    start = start + (0.06 if pair == "apart" else 0.0)
-    both = []
-    for way in (lambda p, q: robust_chamfer(p, q, mp, mq, K).loss.sum(), lambda p, q: brute(p, q, mp, mq)):
-        depth = start.clone().requires_grad_()
-        loss = way(unproject(depth, K), unproject(dq, K))
-        loss.backward()
-        both.append((loss.item(), depth.grad))
-    assert both[0][0] == pytest.approx(both[1][0], rel=1e-5)
-    assert (both[0][1] - both[1][1]).norm() <= 1e-5 * both[1][1].norm()
+@pytest.mark.gpu
+@pytest.mark.parametrize("surface", SURFACES)
+def test_the_kernel_finds_the_nearest(surface):
+    """The same on a GPU, and larger."""
+    from tofcapture_model.losses.chamfer import tiles
+
+    for mask in MASKS:
+        check(tiles, pair(surface, mask, SHAPES[3]), "cuda")
+
+
+def test_the_kernel_compiles_for_a_gpu(monkeypatch, tmp_path):
+    """For compute capability 9.0, without such a GPU: one warp needs neither barriers nor memory to spill to."""
+    triton = pytest.importorskip("triton")
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    from tofcapture_model.losses.chamfer import tiles
+
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("TRITON_DEFAULT_FP_FUSION", "1")  # what it does unset, with a warning
+    kinds = dict.fromkeys(("points", "boxes", "shifts", "squared"), "*fp32") | {
+        "codes": "*i32",
+        "tiles": "i32",
+    }
+    constants = {"POINTS": tiles.POINTS, "PART": tiles.PART, "BLOCK": tiles.BLOCK}
+    source = ASTSource(tiles.search, kinds | dict.fromkeys(constants, "constexpr"), constexprs=constants)
+    made = triton.compile(source, target=GPUTarget("cuda", 90, 32), options={"num_warps": 1})
+    assert len(made.asm["cubin"]) > 0
+    assert "bar.sync" not in made.asm["ptx"]
+    assert made.metadata.shared == 0
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("mask", ["full", "holes", "corner"])
+def test_the_loss_and_its_gradient_are_those_of_brute_force(surface, mask):
+    """Value to 1e-6, winner, gradient in float64; the losers' bounds do not exceed their distances."""
+    p, q, p_mask, q_mask = pair(surface, mask, (35, 50), seed=7)
+    p = p.requires_grad_()
+    found = robust_chamfer(p[None], q[None], p_mask[None, None], q_mask[None, None])
+    found.loss.sum().backward()
+    tables = [brute(p, q, p_mask, q_mask, s) for s in SHIFTS]
+    losses = np.array([t.min(1).mean() + t.min(0).mean() for t in tables])
+    winner = found.winner.item()
+    assert found.loss.item() == pytest.approx(losses.min(), rel=1e-6, abs=1e-12)
+    assert losses[winner] == pytest.approx(losses.min(), rel=1e-6, abs=1e-12)
+    assert (found.candidates[0].numpy() <= losses * (1 + 1e-5) + 1e-12).all()
+    exact = p.detach().double().requires_grad_()
+    a, b = exact[:, p_mask].T + SHIFTS[winner].double(), q.double()[:, q_mask].T
+    to_q, to_p = torch.tensor(tables[winner].argmin(1)), torch.tensor(tables[winner].argmin(0))
+    ((a - b[to_q]).square().sum(1).mean() + (a[to_p] - b).square().sum(1).mean()).backward()
+    if surface != "flat":  # draws between neighbours have no one gradient
+        assert (p.grad.double() - exact.grad).norm() <= 1e-5 * exact.grad.norm()
+    assert (p.grad[:, ~p_mask] == 0).all()
+
+
+@pytest.mark.parametrize("threads", [1, 5])
+def test_threads_change_nothing(threads):
+    """The loss, the winner and every bound are the same bits whatever the number of threads."""
+    p, q, p_mask, q_mask = (x[None] for x in pair("stepped", "holes", (150, 170)))
+    before, found = torch.get_num_threads(), []
+    try:
+        for count in (2, threads):
+            torch.set_num_threads(count)
+            found.append(robust_chamfer(p, q, p_mask[None], q_mask[None]))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
 def test_a_batch_is_its_items():
-    """Items do not see each other."""
-    (a, ma), (b, mb) = surface(0), stepped(1)
-    p, q = unproject(torch.cat([a, b]) + 0.003, K.expand(2, 4)), unproject(torch.cat([b, a]), K.expand(2, 4))
-    mask = torch.cat([ma, mb])
-    both = robust_chamfer(p, q, mask, mask, K.expand(2, 4)).loss
+    """Items do not see each other; one without points costs nothing and has no NaN in its gradient."""
+    items = [pair("smooth", "holes", (19, 23)), pair("stepped", "sparse", (19, 23), 1)]
+    items.append((*items[0][:2], items[0][2] & False, items[0][3]))
+    p, q, p_mask, q_mask = (torch.stack(x) for x in zip(*items, strict=True))
+    p = p.requires_grad_()
+    both = robust_chamfer(p, q, p_mask[:, None], q_mask[:, None]).loss
+    both.sum().backward()
     alone = [
-        robust_chamfer(p[i : i + 1], q[i : i + 1], mask[i : i + 1], mask[i : i + 1], K).loss for i in range(2)
+        robust_chamfer(*(x[None] for x in (a, b)), *(x[None, None] for x in (m, n))).loss
+        for a, b, m, n in items
     ]
     assert torch.equal(both, torch.cat(alone))
+    assert both[2] == 0
+    assert torch.isfinite(p.grad).all()
 
 
-def test_the_soft_least_lies_between_the_least_and_the_mean():
-    """A small softness gives the least of the seven, a large one their mean; all candidates then are exact."""
-    (dp, mask), (dq, _) = surface(0), surface(1)
-    p, q = unproject(dp + 0.003, K), unproject(dq, K)
-    hard = robust_chamfer(p, q, mask, mask, K).loss.item()
-    tight, loose = (robust_chamfer(p, q, mask, mask, K, softness=s) for s in (1e-8, 1.0))
-    assert tight.loss.item() == pytest.approx(hard, rel=1e-2)
-    assert loose.loss.item() == pytest.approx(loose.candidates.mean().item(), rel=1e-3)
-
-
-def test_distances_to_planes_forgive_what_slides_along_them():
-    """A facing plane that moved sideways by 3 mm costs nothing to its tangent planes, but does to its points."""
-    depth = torch.full((1, 1, *SHAPE), 0.8)
-    mask = torch.ones_like(depth, dtype=torch.bool)
-    q = unproject(depth, K)
-    p = q + torch.tensor([0.003, 0.0, 0.0])[None, :, None, None]
-    normals = torch.zeros_like(q)
+def facing(offset):
+    """A facing plane, moved; its truth; full masks; normals of the truth."""
+    q = unproject(torch.full((1, 1, 36, 48), 0.8), K)
+    mask, normals = torch.ones(1, 1, 36, 48, dtype=torch.bool), torch.zeros_like(q)
     normals[:, 2] = -1
-    assert robust_chamfer(p, q, mask, mask, K, normals=normals).loss.item() < 1e-12
-    assert robust_chamfer(p, q, mask, mask, K).loss.item() > 1e-6
+    return q + torch.tensor(offset)[None, :, None, None], q, mask, mask, normals
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_bias_of_exactly_one_jitter_costs_nothing(axis, sign):
     """The minimum over seven copies forgives 10 mm along an axis entirely: eq. 1 has to supervise absolute depth."""
-    depth, mask = surface()
-    q = unproject(depth, K)
-    p = q.clone()
+    q = cloud("smooth", (36, 48), np.random.default_rng(0))[None]
+    p, mask = q.clone(), torch.ones(1, 1, 36, 48, dtype=torch.bool)
     p[:, axis] += sign * 0.010
-    found = robust_chamfer(p, q, mask, mask, K)
+    found = robust_chamfer(p, q, mask, mask)
     assert found.loss.item() < 1e-12
     assert found.winner.item() == 1 + 2 * axis + (sign > 0)
 
@@ -141,45 +214,58 @@ def test_a_bias_of_exactly_one_jitter_costs_nothing(axis, sign):
 @pytest.mark.parametrize("bias", [0.005, -0.005])
 def test_half_a_jitter_costs_its_square_twice(bias):
     """A z bias of 5 mm of a facing plane costs 25 mm^2 per point in each direction, to either side."""
-    depth = torch.full((1, 1, *SHAPE), 0.8)
-    mask = torch.ones_like(depth, dtype=torch.bool)
-    q = unproject(depth, K)
-    p = q + torch.tensor([0.0, 0.0, bias])[None, :, None, None]
-    loss = robust_chamfer(p, q, mask, mask, K).loss.item()
-    assert loss == pytest.approx(2 * 25e-6, rel=1e-3)
+    *clouds, _ = facing((0.0, 0.0, bias))
+    assert robust_chamfer(*clouds).loss.item() == pytest.approx(2 * 25e-6, rel=1e-3)
 
 
 def test_lengths_scale_squared():
     """Scaling all lengths, the jitter included, by k scales the loss by k^2."""
-    (dp, mask), (dq, _) = surface(0), surface(1)
-    p, q = unproject(dp + 0.003, K), unproject(dq, K)
-    one = robust_chamfer(p, q, mask, mask, K).loss.item()
-    assert robust_chamfer(3 * p, 3 * q, mask, mask, K, jitter=0.03).loss.item() == pytest.approx(
-        9 * one, rel=1e-4
+    p, q, p_mask, q_mask = (x[None] for x in pair("smooth", "holes", (35, 50)))
+    one, thrice = (
+        robust_chamfer(k * p, k * q, p_mask[None], q_mask[None], 0.01 * k).loss.item() for k in (1, 3)
     )
+    assert thrice == pytest.approx(9 * one, rel=1e-4)
 
 
-def test_gradient_moves_only_masked_points_and_agrees_with_differences():
-    """Points outside the mask get no gradient; one inside gets the finite difference."""
-    depth, mask = surface()
-    q = unproject(surface(1)[0], K)
-    moving = (depth + 0.002).requires_grad_()
-    robust_chamfer(unproject(moving, K), q, mask, mask, K).loss.sum().backward()
-    assert (moving.grad[~mask] == 0).all()
-    at = tuple(mask.nonzero()[400].tolist())
-    step = torch.zeros_like(depth)
-    step[at] = 2e-4
-    above, below = (
-        robust_chamfer(unproject(moving.detach() + s, K), q, mask, mask, K).loss for s in (step, -step)
+def test_the_soft_least_lies_between_the_least_and_the_mean():
+    """A small softness gives the least of the seven, a large one their mean; all candidates then are exact."""
+    p, q, p_mask, q_mask = (x[None] for x in pair("smooth", "holes", (35, 50)))
+    hard, tight, loose = (
+        robust_chamfer(p, q, p_mask[None], q_mask[None], softness=s) for s in (0.0, 1e-8, 1.0)
     )
-    assert moving.grad[at].item() == pytest.approx(((above - below) / 4e-4).item(), rel=0.05)
+    assert tight.loss.item() == pytest.approx(hard.loss.item(), rel=1e-2)
+    assert loose.loss.item() == pytest.approx(loose.candidates.mean().item(), rel=1e-3)
 
 
-def test_items_without_points_cost_nothing():
-    """An empty mask gives zero and no NaN."""
-    depth, mask = surface()
-    moving = depth.clone().requires_grad_()
-    loss = robust_chamfer(unproject(moving, K), unproject(depth, K), mask & False, mask, K).loss
-    loss.sum().backward()
-    assert loss.item() == 0
-    assert torch.isfinite(moving.grad).all()
+def test_distances_to_planes_forgive_what_slides_along_them():
+    """A facing plane that moved sideways by 3 mm costs nothing to its tangent planes, but does to its points."""
+    *clouds, normals = facing((0.003, 0.0, 0.0))
+    assert robust_chamfer(*clouds, normals=normals).loss.item() < 1e-12
+    assert robust_chamfer(*clouds).loss.item() > 1e-6
+
+
+def test_distances_to_planes_are_taken_along_the_normal_of_the_truth_either_way():
+    """P to Q along the normal of the nearest q, Q to P along that of q itself: all seven candidates, and the least of them."""
+    rng = np.random.default_rng(0)
+    truth = torch.tensor(0.8 + 0.05 * np.sin(np.mgrid[:18, :24][1] / 3), dtype=torch.float32)[None, None]
+    p = unproject(truth + torch.tensor(rng.normal(0, 0.02, (18, 24)), dtype=torch.float32), K)
+    q, normals = unproject(truth, K), depth_to_normals(truth, torch.ones_like(truth), K, 1)
+    a, b, n = (x[0].flatten(1).T for x in (p, q, normals))
+    mask, expected = torch.ones(1, 1, 18, 24, dtype=torch.bool), []
+    for shift in SHIFTS:
+        table = brute(p[0], q[0], mask[0, 0], mask[0, 0], shift)
+        to_q, to_p = table.argmin(1), table.argmin(0)
+        forward, backward = ((a + shift - b[to_q]) * n[to_q]).sum(1), ((a[to_p] + shift - b) * n).sum(1)
+        expected.append((forward.square().mean() + backward.square().mean()).item())
+    found = robust_chamfer(p, q, mask, mask, normals=normals)
+    assert found.candidates[0].tolist() == pytest.approx(expected, rel=1e-3)
+    assert found.loss.item() == pytest.approx(min(expected), rel=1e-3)
+    assert found.winner.item() == np.argmin(expected)
+
+
+if __name__ == "__main__":
+    from tofcapture_model.losses.chamfer import tiles
+
+    for each in SURFACES:
+        check(tiles, pair(each, "sparse" if each == "apart" else "holes", (13, 21)))
+        print(each, flush=True)

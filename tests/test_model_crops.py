@@ -10,8 +10,8 @@ torch = pytest.importorskip("torch")
 
 from tests.test_model_baselines import target
 from tests.test_model_networks import frame
-from tofcapture_model.data.frame import Frame, Target
-from tofcapture_model.data.frames import FrameDataset, crop, mirror
+from tofcapture_model.data import FrameDataset, crop, mirror
+from tofcapture_model.frame import Frame, Target
 from tofcapture_model.geometry.intrinsics import scale_intrinsics
 from tofcapture_model.geometry.maps import unproject
 

@@ -18,8 +18,8 @@ from tests.analytic import make_dataset
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.seal import sha256_of
-from tofcapture_model.data import frames as module
-from tofcapture_model.data.frames import (
+from tofcapture_model import data as module
+from tofcapture_model.data import (
     FrameDataset,
     SampleId,
     collate,
@@ -31,7 +31,7 @@ from tofcapture_model.data.frames import (
 from tofcapture_model.data.raw_input import NOMINAL_CAMERA
 from tofcapture_model.geometry.intrinsics import scale_intrinsics
 from tofcapture_model.geometry.maps import depth_to_normals
-from tofcapture_model.training.checkpoint import load_model
+from tofcapture_model.networks.checkpoint import load_model
 
 
 @pytest.fixture(scope="module")

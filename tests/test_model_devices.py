@@ -19,7 +19,7 @@ from tests.analytic import make_dataset
 from tofcapture.errors import ConfigError
 from tofcapture_model.config import Stage, preset
 from tofcapture_model.evaluation.evaluate import evaluate
-from tofcapture_model.training.learner import Group, processes
+from tofcapture_model.training import Group, processes
 from tofcapture_model.training.train import train
 
 ROOT = Path(__file__).parents[1]
@@ -91,7 +91,7 @@ def test_the_cpu_is_taken_when_it_is_asked_for(monkeypatch):
         pretended(monkeypatch, 1, WORLD_SIZE="2", RANK="1", LOCAL_RANK="1") as chosen,
         processes("cpu") as group,
     ):
-        assert group.place == torch.device("cpu")
+        assert group.device == torch.device("cpu")
     assert chosen == {"device": [], "group": ["gloo"]}
 
 
@@ -108,7 +108,6 @@ def test_machines_that_share_no_folder_go_on_together(dataset, tmp_path):
     (tmp_path / "go.py").write_text(
         "import sys, json; from pathlib import Path; from dataclasses import replace\n"
         "from tofcapture_model.config import preset, Stage; from tofcapture_model.training.train import train\n"
-        "import tofcapture_model.training.train as t\n"
         "c = preset('demo'); c = replace(c, network=replace(c.network, width=2, levels=2), stages=(Stage('joint', 2),),"
         " training=replace(c.training, batch=1, crop=(32, 32)))\n"
         "stop = int(sys.argv[3]) or None\n"
@@ -151,7 +150,7 @@ def test_machines_that_share_no_folder_go_on_together(dataset, tmp_path):
     assert first == second
     assert first[1]
     assert both("whole", 0)[0] == first
-    from tofcapture_model.training.checkpoint import load_model
+    from tofcapture_model.networks.checkpoint import load_model
 
     models = [load_model(tmp_path / f"{name}0")[0].state_dict() for name in ("stopped", "whole")]
     assert all(torch.equal(a, b) for a, b in zip(*(m.values() for m in models), strict=True))

@@ -22,8 +22,8 @@ from tofcapture_model.inference import export as exporting
 from tofcapture_model.inference import predict as predicting
 from tofcapture_model.inference.export import export
 from tofcapture_model.inference.predict import predict
-from tofcapture_model.training import checkpoint
-from tofcapture_model.training.checkpoint import load_model, save_model
+from tofcapture_model.networks import checkpoint
+from tofcapture_model.networks.checkpoint import load_model, save_model
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 SIZE = SMALL.shape

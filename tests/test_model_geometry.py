@@ -23,7 +23,7 @@ from tofcapture_model.geometry.maps import (
     unit,
     unproject,
 )
-from tofcapture_model.networks.refine import Refinement
+from tofcapture_model.networks.heads import Refinement
 
 CAMERA = Camera(60, 48, 190.6, 200.8, 29.2, 22.7)
 

@@ -10,8 +10,7 @@ pytest.importorskip("torch")
 
 from tests.analytic import make_dataset
 from tofcapture.files.manifest import load_manifest
-from tofcapture_model.training.checkpoint import find_model, load_model
-from tofcapture_model.training.learned import learned_from, not_new, sentence
+from tofcapture_model.networks.checkpoint import find_model, learned_from, load_model, not_new, sentence
 
 TOLD = (["mug", "lid"], ["s001-bowl"], ["lid"])
 

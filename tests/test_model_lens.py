@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 torch = pytest.importorskip("torch")
 
 from tests.analytic import make_dataset
-from tests.test_model_chamfer import oracle
 from tests.test_model_predict import saved
 from tests.test_model_predict_inputs import SMALL, save_network, wall
 from tofcapture.camera import Camera
@@ -22,10 +21,7 @@ from tofcapture.errors import ConfigError
 from tofcapture.frames import TofInfo
 from tofcapture.rig import Rig, dumps_rig
 from tofcapture_model.config import Config, Network, Stage, preset
-from tofcapture_model.data.augment import RawItem
-from tofcapture_model.data.augment import crop as crop_item
-from tofcapture_model.data.augment import flip as flip_item
-from tofcapture_model.data.frames import FrameDataset, collate, crop, frame_decoder, mirror
+from tofcapture_model.data import FrameDataset, collate, crop, frame_decoder, mirror
 from tofcapture_model.data.raw_input import NOMINAL_CAMERA
 from tofcapture_model.evaluation.evaluate import evaluate
 from tofcapture_model.geometry.decoder import TorchDecoder
@@ -40,12 +36,10 @@ from tofcapture_model.geometry.intrinsics import (
     with_lens,
 )
 from tofcapture_model.geometry.maps import depth_to_normals, propagate_depth, unproject
+from tofcapture_model.geometry.multipath import _patches, cues
 from tofcapture_model.inference import onnx_backend
 from tofcapture_model.inference import predict as predicting
 from tofcapture_model.inference.predict import Predictor, predict
-from tofcapture_model.losses.chamfer import neighbours
-from tofcapture_model.losses.chamfer.robust import candidate_shifts, robust_chamfer
-from tofcapture_model.networks.multipath import _patches, cues
 from tofcapture_model.training.train import train
 
 PLAIN = Camera(120, 90, 95.0, 100.0, 58.4, 50.7)
@@ -235,25 +229,6 @@ def test_patches_have_the_size_that_the_lens_gives_them():
     torch.testing.assert_close(plain, rays(shifted, 15, 18), atol=1e-6, rtol=0)
 
 
-def test_the_search_in_a_grid_is_exact_through_a_lens():
-    """The slowest search looks along a pinhole's rays, and so much wider as the lens bends them."""
-    camera = Camera(48, 36, 60.0, 60.0, 23.5, 17.5, (-0.2, 0.05, 0.001, 0.001, 0.0))
-    rng = np.random.default_rng(3)
-    p, q = (
-        unproject(0.8 + 0.03 * torch.from_numpy(rng.random((1, 1, *camera.shape))).float(), numbers(camera))
-        for _ in range(2)
-    )
-    mask = torch.from_numpy(rng.random((1, 1, *camera.shape)) > 0.2)
-    truth = [oracle(p, q, mask, mask, s) for s in candidate_shifts().numpy()]
-    found = neighbours.nearest(p[0], q[0], mask[0, 0], mask[0, 0], numbers(camera)[0, :4], candidate_shifts())
-    for one, expected in zip(found, truth, strict=True):
-        mean = one.squared[0][mask[0, 0]].mean() + one.squared[1][mask[0, 0]].mean()
-        assert mean.item() == pytest.approx(expected, rel=1e-5)
-    assert robust_chamfer(p, q, mask, mask, numbers(camera)).loss.item() == pytest.approx(
-        min(truth), rel=1e-5
-    )
-
-
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory):
     """A dataset through a strong lens, and one without, at half the sensor's resolution."""
@@ -264,7 +239,7 @@ def seen(tmp_path_factory):
 
 
 def test_frames_crops_and_mirrors_keep_the_geometry(seen):
-    """Plane fits of the ground truth give its normals, in a whole frame, a window, a mirror, and as a raw item's."""
+    """Plane fits of the ground truth give its normals, in a whole frame, a window and a mirror."""
     data = FrameDataset([seen[0]], "train")
     frame, target = data[(0, 0)]
     assert frame.intrinsics.shape == (9,)
@@ -281,24 +256,6 @@ def test_frames_crops_and_mirrors_keep_the_geometry(seen):
         mirror(frame, target, -2),
     ):
         assert off(*changed) < 0.3
-    item = RawItem(
-        frame.raw,
-        target.depth[0],
-        target.normals.permute(1, 2, 0),
-        target.good[0].byte(),
-        frame.intrinsics,
-        torch.zeros(3),
-    )
-    for changed in (flip_item(item), crop_item(item, 9, 31, (48, 64))):
-        again = (
-            frame._replace(intrinsics=changed.intrinsics),
-            target._replace(
-                depth=changed.depth[None],
-                normals=changed.normals.permute(2, 0, 1),
-                good=changed.mask[None] > 0,
-            ),
-        )
-        assert off(*again) < 0.3
 
 
 def test_cameras_with_and_without_a_lens_share_a_batch(seen):

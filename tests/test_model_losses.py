@@ -7,7 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from tofcapture_model.losses.losses import (
+from tofcapture_model.losses import (
     DELTA,
     EPSILON,
     MIN_ERROR,

@@ -10,9 +10,9 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from tofcapture.rig import SPEED_OF_LIGHT
+from tofcapture_model.geometry import multipath
 from tofcapture_model.geometry.intrinsics import rays
-from tofcapture_model.networks import multipath
-from tofcapture_model.networks.multipath import SIGNAL, cues, exchange_error, halo_error, surface
+from tofcapture_model.geometry.multipath import SIGNAL, cues, exchange_error, halo_error, surface
 
 K = torch.tensor([[90.0, 90.0, 59.5, 44.5]])
 SHAPE = (90, 120)

@@ -23,12 +23,11 @@ from tofcapture_model.config import (
     preset,
     presets,
 )
-from tofcapture_model.data.frame import Frame
-from tofcapture_model.networks.baselines.sensor import estimate as sensor_estimate
-from tofcapture_model.networks.baselines.sensor import upsample_depth
-from tofcapture_model.networks.joint import JointModel
+from tofcapture_model.frame import Frame
+from tofcapture_model.networks import build_model, select_stage
+from tofcapture_model.networks.baselines import sensor_estimate, upsample_depth
+from tofcapture_model.networks.joint import CompactModel, PaperModel
 from tofcapture_model.networks.unet import UNet, bilinear_logits, convex_upsample, pad_to_multiple
-from tofcapture_model.networks.zoo import build_model, select_stage
 
 TINY_PAPER = Network(width=2, levels=3, refine_iterations=1)
 TINY_COMPACT = replace(preset("demo").network, width=4, levels=2, refine_iterations=1)
@@ -38,6 +37,11 @@ def four_phases():
     """(4, 8) matrix of I and Q of two frequencies, each at 0, 90, 180, 270 degrees."""
     pair = torch.tensor([[0.5, 0, -0.5, 0], [0, -0.5, 0, 0.5]])
     return torch.block_diag(pair, pair)
+
+
+def joint(network):
+    """Our model of a kind."""
+    return (CompactModel if network.kind == "compact" else PaperModel)(network)
 
 
 def frame(h=36, w=44, batch=2, seed=0):
@@ -97,7 +101,7 @@ def test_convex_upsampling_starts_as_bilinear_and_never_overshoots():
 def test_an_untrained_model_is_the_sensor(network):
     """Zero-initialised heads: depth is the bilinear decoded depth, normals are unit and face the camera, before refinement and after."""
     data = frame()
-    found = JointModel(network)(data)
+    found = joint(network)(data)
     bilinear = torch.nn.functional.interpolate(
         data.depth, scale_factor=2, mode="bilinear", align_corners=False
     )
@@ -112,7 +116,7 @@ def test_an_untrained_model_is_the_sensor(network):
 @pytest.mark.parametrize("stage", ["depth", "normal", "refine", "joint"])
 def test_every_stage_trains_its_parts_and_no_others(network, stage):
     """A stage's parameters get gradients, the others are frozen."""
-    model = JointModel(network)
+    model = joint(network)
     learning = {id(p) for p in select_stage(model, stage)}
     out = model(frame(), stage)
     (out.depth.square().mean() + out.normals.mean() + out.error.mean()).backward()
@@ -124,7 +128,7 @@ def test_every_stage_trains_its_parts_and_no_others(network, stage):
 
 def test_the_residual_is_bounded_where_asked():
     """compact cannot move a depth beyond its candidates by more than max_residual."""
-    model = JointModel(replace(TINY_COMPACT, max_residual=0.02, refine_iterations=0))
+    model = joint(replace(TINY_COMPACT, max_residual=0.02, refine_iterations=0))
     with torch.no_grad():
         model.raw2depth.net.bias[model.raw2depth.candidates] = 1e6
     data = frame()
@@ -134,8 +138,8 @@ def test_the_residual_is_bounded_where_asked():
 
 def test_the_paper_s_networks_read_the_inputs_of_the_ablation():
     """Raw only, as in table IV, is 8 channels; all are 10."""
-    assert JointModel(replace(TINY_PAPER, inputs=("raw",))).inputs.channels == 8
-    assert JointModel(TINY_PAPER).inputs.channels == 10
+    assert joint(replace(TINY_PAPER, inputs=("raw",))).inputs.channels == 8
+    assert joint(TINY_PAPER).inputs.channels == 10
 
 
 @pytest.mark.parametrize(
@@ -144,7 +148,7 @@ def test_the_paper_s_networks_read_the_inputs_of_the_ablation():
 def test_rows_without_depth_do_not_see_it(inputs, sees):
     """Another decoded depth changes the answer of a network that reads it, and nothing of one that does not."""
     torch.manual_seed(0)
-    model = JointModel(replace(TINY_PAPER, inputs=inputs)).eval()
+    model = joint(replace(TINY_PAPER, inputs=inputs)).eval()
     for part in (model.raw2depth, model.error_map, model.raw2normal):
         torch.nn.init.normal_(part.net.last.weight, std=0.05)
     one = frame()

@@ -8,10 +8,9 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from tofcapture_model.config import Losses
-from tofcapture_model.data.frame import Estimate, Target
+from tofcapture_model.frame import Estimate, Target
 from tofcapture_model.geometry.maps import unit, unproject
-from tofcapture_model.losses.chamfer.robust import robust_chamfer
-from tofcapture_model.losses.losses import (
+from tofcapture_model.losses import (
     angle_loss,
     cosine_loss,
     error_map_loss,
@@ -20,6 +19,7 @@ from tofcapture_model.losses.losses import (
     objective,
     reweighted_smooth_l1,
 )
+from tofcapture_model.losses.chamfer import robust_chamfer
 
 SHAPE = (12, 16)
 K = torch.tensor([[20.0, 20.0, 7.5, 5.5]] * 2)
@@ -76,7 +76,7 @@ def test_every_part_is_its_loss_of_the_stage_s_maps_times_its_weight(weights, st
     weight = target.good + weights.context * target.context
     lambda_error = error if weights.reweight else truth
     uncertainty, angles = (laplace_loss, angle_loss) if weights is OURS else (error_map_loss, cosine_loss)
-    clouds = unproject(depth, K), unproject(truth, K), target.good, target.good, K, weights.jitter
+    clouds = unproject(depth, K), unproject(truth, K), target.good, target.good, weights.jitter
     plane = {"normals": target.normals, "softness": 3e-6} if weights is OURS else {}
     expected = {
         "depth": weights.depth * reweighted_smooth_l1(depth, truth, lambda_error, weight, weights.delta),

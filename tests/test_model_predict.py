@@ -23,15 +23,14 @@ from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
 from tofcapture.ops.phase import taps
 from tofcapture.rig import SPEED_OF_LIGHT, Rig, dumps_rig
 from tofcapture_model.config import preset
-from tofcapture_model.data.frame import frame_to
-from tofcapture_model.data.frames import batched, frame_decoder, make_frame, with_cues
+from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
 from tofcapture_model.data.raw_input import NOMINAL_CAMERA, NOMINAL_RANGE_ERRORS, read_input
+from tofcapture_model.frame import frame_to
 from tofcapture_model.geometry.decoder import TorchDecoder
 from tofcapture_model.inference import predict as predicting
 from tofcapture_model.inference.predict import predict, predict_raw, recorded
-from tofcapture_model.networks.zoo import build_model
-from tofcapture_model.training import checkpoint
-from tofcapture_model.training.checkpoint import find_model, load_model, save_model
+from tofcapture_model.networks import build_model, checkpoint
+from tofcapture_model.networks.checkpoint import find_model, load_model, save_model
 
 ORDER = ("right", "blocks swapped", "interleaved", "reversed", "low reversed", "pairs")
 CHANNELS = (

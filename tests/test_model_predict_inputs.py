@@ -25,9 +25,8 @@ from tofcapture_model.config import Config, Network, Stage, preset
 from tofcapture_model.data.raw_input import NOMINAL_CAMERA, NOMINAL_RANGE_ERRORS, RawInput, read_input, taken
 from tofcapture_model.inference import predict as predicting
 from tofcapture_model.inference.predict import Predictor, predict, predict_raw
-from tofcapture_model.networks.zoo import build_model
-from tofcapture_model.training import checkpoint
-from tofcapture_model.training.checkpoint import find_model, load_model, save_model
+from tofcapture_model.networks import build_model, checkpoint
+from tofcapture_model.networks.checkpoint import find_model, load_model, save_model
 
 ROOT = Path(__file__).parents[1]
 SMALL = Camera(48, 36, 38.0, 38.0, 23.5, 17.5)

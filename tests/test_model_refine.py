@@ -8,12 +8,11 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from tests.test_model_geometry import CAMERA, intrinsics, plane
-from tests.test_model_networks import TINY_COMPACT, frame
+from tests.test_model_networks import TINY_COMPACT, frame, joint
 from tofcapture_model.geometry.intrinsics import scale_intrinsics
 from tofcapture_model.geometry.maps import depth_to_normals, propagate_depth, unit
-from tofcapture_model.losses.losses import MIN_ERROR
-from tofcapture_model.networks.joint import JointModel
-from tofcapture_model.networks.refine import Refinement
+from tofcapture_model.losses import MIN_ERROR
+from tofcapture_model.networks.heads import Refinement
 
 K = intrinsics(CAMERA, torch.float32)
 
@@ -84,7 +83,7 @@ def test_votes_count_by_the_confidence_of_the_voter(at):
 def test_the_model_refines_what_it_found_at_twice_the_resolution():
     """With the intrinsics of the fine grid; the estimate before refinement is kept beside it."""
     torch.manual_seed(0)
-    model = JointModel(TINY_COMPACT).eval()
+    model = joint(TINY_COMPACT).eval()
     data = frame()
     with torch.no_grad():
         found = model(data)

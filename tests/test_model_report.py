@@ -29,13 +29,13 @@ from tofcapture.ops.phase import taps
 from tofcapture.poses import look_at
 from tofcapture.rig import SPEED_OF_LIGHT, Rig
 from tofcapture_model.config import preset
-from tofcapture_model.networks.zoo import build_model
+from tofcapture_model.networks import build_model
+from tofcapture_model.networks.checkpoint import save_model
 from tofcapture_model.report import write_report
 from tofcapture_model.report.content import loss_curve, origin_of
 from tofcapture_model.report.examples import choose
 from tofcapture_model.report.scores import headline, method_title, tables, tiles
-from tofcapture_model.training.checkpoint import save_model
-from tofcapture_model.training.runlog import read_metrics
+from tofcapture_model.training import read_metrics
 
 CAMERA = Camera(64, 48, 50.0, 52.0, 31.0, 24.5)
 SECTIONS = ("numbers", "examples", "alignment", "rig", "made", "limits")

@@ -22,10 +22,10 @@ from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import taps
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.config import Config, Network, Stage, preset
-from tofcapture_model.data.frames import batched, make_frame
+from tofcapture_model.data import batched, make_frame
 from tofcapture_model.evaluation.evaluate import evaluate
-from tofcapture_model.networks.zoo import build_model
-from tofcapture_model.training.checkpoint import find_model
+from tofcapture_model.networks import build_model
+from tofcapture_model.networks.checkpoint import find_model
 from tofcapture_model.training.train import train
 
 HZ = (15e6,) * 3 + (75e6,) * 3

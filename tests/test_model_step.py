@@ -13,12 +13,13 @@ torch = pytest.importorskip("torch")
 from tests.analytic import make_dataset
 from tests.test_model_baselines import target
 from tests.test_model_networks import frame
+from tofcapture.ops.phase import TapNoise
 from tofcapture_model.config import preset
+from tofcapture_model.data.augment import BurstNoise
 from tofcapture_model.evaluation.evaluate import ONE_SIGMA, calibrate
-from tofcapture_model.networks.zoo import build_model
-from tofcapture_model.training import learner as module
-from tofcapture_model.training.learner import MAX_NORM, Group, Learner
-from tofcapture_model.training.runlog import Position
+from tofcapture_model.networks import build_model, training_loss
+from tofcapture_model.training import Group, Position
+from tofcapture_model.training.train import MAX_NORM, Learner
 
 
 def small(rank=0, **training):
@@ -31,51 +32,46 @@ def small(rank=0, **training):
         training=replace(config.training, **training),
     )
     torch.manual_seed(0)
-    return Learner(build_model(config), config, config.stages[0], Group(rank, 1, torch.device("cpu")), {})
+    model = build_model(config)
+    learner = Learner(model, config, config.stages[0], Group(rank, 1, torch.device("cpu")))
+    learner.model = model
+    return learner
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """What the augmentations were called for, and the first number that each drew."""
-    calls = []
-    for name in ("redraw_frame", "redraw_calibration"):
-
-        def draw(data, generator, *_args, name=name):
-            calls.append((name, torch.rand(1, generator=generator).item()))
-            return data
-
-        monkeypatch.setattr(module, name, draw)
-    return calls
+BURST = BurstNoise(4, TapNoise(), 4095.0)
 
 
-def test_what_is_drawn_depends_on_the_step_and_the_process(drawn):
+def test_what_is_drawn_depends_on_the_step_and_the_process():
     """The same position draws the same, whatever came before; another step, stage or process something else."""
     data = frame(12, 16, batch=1)
     places = [(0, 0, 0), (0, 1, 0), (1, 1, 0), (0, 1, 1), (0, 0, 0)]
-    for stage, step, rank in places:
-        small(rank).loss(data, target(data), object(), Position(stage=stage, step=step))
-    numbers = [number for _, number in drawn]
-    assert numbers[0] == numbers[-1]
-    assert len(set(numbers)) == len(places) - 1
+    drawn = [
+        small(rank).augmented(data, BURST, Position(stage=stage, step=step)).raw.double().sum().item()
+        for stage, step, rank in places
+    ]
+    assert drawn[0] == drawn[-1]
+    assert len(set(drawn)) == len(places) - 1
 
 
-@pytest.mark.parametrize("burst", [None, object()])
+@pytest.mark.parametrize("burst", [None, BURST])
 @pytest.mark.parametrize("phase_error", [0.0, 0.003])
-def test_noise_is_drawn_for_means_of_bursts_and_calibration_where_asked(drawn, burst, phase_error):
-    """Each alone, both, or neither."""
+def test_noise_is_drawn_for_means_of_bursts_and_calibration_where_asked(burst, phase_error):
+    """Fresh noise changes the taps, another calibration depths and the gap's cue; each alone, both, or neither."""
     data = frame(12, 16, batch=1)
-    small(phase_error=phase_error).loss(data, target(data), burst, Position())
-    assert [name for name, _ in drawn] == ["redraw_frame"] * bool(burst) + ["redraw_calibration"] * bool(
-        phase_error
-    )
+    found = small(phase_error=phase_error).augmented(data, burst, Position())
+    assert torch.equal(found.raw, data.raw) == (burst is None)
+    assert torch.equal(found.cues, data.cues) == (phase_error == 0)
+    assert torch.equal(found.depth, data.depth) == (burst is None and phase_error == 0)
 
 
 def test_a_gradient_is_cut_to_its_norm_and_no_step_goes_further():
     """A loss a thousand times too large gives a gradient of norm MAX_NORM; the norm that it had is told."""
     data, one = frame(12, 16, batch=1), small()
-    truth = target(data)
-    loss = one.loss(data, truth._replace(depth=truth.depth + 5), None, Position())
-    told = one.gradient(loss._replace(total=1e3 * loss.total))
+    truth, losses = target(data), replace(preset("demo").losses, chamfer=0.0)
+    loss = training_loss(
+        one.model, losses, "joint", one.forward(data), truth._replace(depth=truth.depth + 5), data
+    )
+    told = one.backward(loss._replace(total=1e3 * loss.total))
     norm = math.sqrt(sum(float(p.grad.square().sum()) for p in one.parameters))
     assert told > 10 * MAX_NORM
     assert norm == pytest.approx(MAX_NORM, rel=1e-3)

@@ -24,16 +24,16 @@ from tofcapture.errors import ConfigError
 from tofcapture.files.cache import pack
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Losses, Stage, preset, presets
-from tofcapture_model.data.frames import make_target
+from tofcapture_model.data import make_target
 from tofcapture_model.evaluation.measures import Precision, Uncertainty, regions
 from tofcapture_model.evaluation.suite import averaged, read_weights
 from tofcapture_model.evaluation.tables import SUITES, cells
 from tofcapture_model.geometry.intrinsics import rays, scale_intrinsics
 from tofcapture_model.inference.predict import predict
-from tofcapture_model.losses.losses import error_map_loss, laplace_loss, reweighting
-from tofcapture_model.networks.zoo import build_model, training_loss
-from tofcapture_model.training.checkpoint import load_model
-from tofcapture_model.training.run_card import budget, closest_preset
+from tofcapture_model.losses import error_map_loss, laplace_loss, reweighting
+from tofcapture_model.networks import build_model, training_loss
+from tofcapture_model.networks.checkpoint import budget, load_model
+from tofcapture_model.training.card import closest_preset
 from tofcapture_model.training.train import train
 
 
@@ -291,7 +291,7 @@ def test_regions_split_the_good_pixels():
 
 def test_the_uncertainty_is_calibrated_on_the_validation_split(dataset, runs):
     """68 % of the errors of the first validation frames lie within the predicted sigma, and the checkpoint says so."""
-    from tofcapture_model.data.frames import FrameDataset, batched
+    from tofcapture_model.data import FrameDataset, batched
 
     model, _, provenance = load_model(runs / "demo-0")
     assert provenance["uncertainty"]["views"] == 2

@@ -20,9 +20,8 @@ from tofcapture.frames import TofInfo
 from tofcapture_model.config import preset
 from tofcapture_model.evaluation import evaluate, suite
 from tofcapture_model.evaluation.tables import SUITES, Column, Suite, cells, write_tables
-from tofcapture_model.networks.zoo import build_model
-from tofcapture_model.training.checkpoint import find_model, save_model
-from tofcapture_model.training.learned import learned_from
+from tofcapture_model.networks import build_model
+from tofcapture_model.networks.checkpoint import find_model, learned_from, save_model
 
 SIX = {
     "modulation_hz": (20e6,) * 3 + (100e6,) * 3,

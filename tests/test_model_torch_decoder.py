@@ -22,7 +22,7 @@ from tofcapture.errors import DataError
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import taps as taps_of
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError
-from tofcapture_model.data.frames import batched, make_frame
+from tofcapture_model.data import batched, make_frame
 from tofcapture_model.data.raw_input import NOMINAL_RANGE_ERRORS
 from tofcapture_model.geometry import decoder as torch_decoder
 from tofcapture_model.geometry.decoder import TorchDecoder, fill_nearest

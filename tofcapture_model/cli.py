@@ -1,4 +1,4 @@
-"""The commands ``train``, ``evaluate``, ``predict`` and ``report``. Nothing heavy is imported before one of them runs."""
+"""The commands ``train``, ``evaluate``, ``predict``, ``export`` and ``report``. Nothing heavy is imported before one runs."""
 
 from __future__ import annotations
 
@@ -6,33 +6,34 @@ import argparse
 import ctypes
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from tofcapture.cli.kit import progress
 from tofcapture.command import Command, Outcome
 from tofcapture.errors import ConfigError, TofError
 from tofcapture_model.config import Config, load_config, preset, presets
 from tofcapture_model.evaluation.tables import SUITES
-from tofcapture_model.training.progress import progress
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # malloc.h
+_WEIGHTS = "checkpoint, folder of a run, or 'bundled' (default: the bundled weights)"
 
 
 def _share_cores() -> None:
     """Let idle OpenMP threads spin for microseconds only; must run before torch is imported.
 
-    Measured on two cores, a training step of six crops: 0.22 s alone (0.32 s if they never spin), 0.65 s beside two busy processes
-    (1.7 s if they spin ten times as long).
+    Measured on two cores, a step of six crops: 0.22 s alone, 0.65 s beside two busy processes, 1.7 s if threads spin ten times
+    as long.
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 
 def _keep_memory() -> None:
-    """Have glibc keep what is freed: it gives blocks of some MB back and asks for zeroed pages again, a sixth of a prediction's time."""
+    """Have glibc keep what is freed: giving back blocks of some MB takes a sixth of a prediction's time."""
     with suppress(OSError, AttributeError, TypeError):  # another system, another C library
         libc = ctypes.CDLL(None)
         libc.mallopt(_MMAP_THRESHOLD, 32 << 20)  # its largest
@@ -55,55 +56,46 @@ def _checked_device(name: str) -> str:
     return name
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"expected a number > 0, got {text}")
-    return value
+def _number(kind: type, expected: str, fine: Callable[[Any], bool]) -> Callable[[str], Any]:
+    """Make an argument's type that refuses what is not fine."""
+
+    def parsed(text: str) -> Any:
+        if not fine(value := kind(text)):
+            raise argparse.ArgumentTypeError(f"expected {expected}, got {text}")
+        return value
+
+    parsed.__name__ = expected  # argparse names it where the text is no number
+    return parsed
 
 
-def _count(text: str) -> int:
-    if int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number > 0, got {text}")
-    return int(text)
-
-
-def _not_negative(text: str) -> int:
-    if int(text) < 0:
-        raise argparse.ArgumentTypeError(f"expected a whole number >= 0, got {text}")
-    return int(text)
+_positive = _number(float, "a number > 0", lambda x: x > 0)
+_count = _number(int, "a whole number > 0", lambda x: x > 0)
+_not_negative = _number(int, "a whole number >= 0", lambda x: x >= 0)
 
 
 def _configure_train(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "dataset",
         type=Path,
         nargs="+",
-        help="folders that build-dataset wrote; validation is on the first one's split val",
+        help="folders that build-dataset wrote; the first one's split val validates",
     )
-    parser.add_argument(
-        "--out", type=Path, required=True, help="folder of the run; running again there goes on"
-    )
-    parser.add_argument(
-        "--preset", choices=presets(), default=None, help="where to start from (default: compact)"
-    )
-    parser.add_argument("--config", type=Path, help="TOML with differences from a preset")
-    parser.add_argument("--epochs", type=_count, help="of every stage, instead of the configuration's")
-    parser.add_argument("--minutes", type=_positive, help="train for so long; schedules follow the clock")
-    parser.add_argument("--seed", type=_not_negative, help="of weights, order and crops")
-    parser.add_argument(
+    add("--out", type=Path, required=True, help="folder of the run; running again there goes on")
+    add("--preset", choices=presets(), help="where to start from (default: compact)")
+    add("--config", type=Path, help="TOML with differences from a preset")
+    add("--epochs", type=_count, help="of every stage, instead of the configuration's")
+    add("--minutes", type=_positive, help="train for so long; schedules follow the clock")
+    add("--seed", type=_not_negative, help="of weights, order and crops")
+    add(
         "--workers",
         type=_not_negative,
         default=0,
-        help="processes that read data (default: 0, data stays in memory)",
+        help="processes that read data (default: 0, it stays in memory)",
     )
-    parser.add_argument(
-        "--from",
-        dest="start",
-        metavar="WEIGHTS",
-        help="fine-tune: start from a checkpoint, a run's folder, or 'bundled' (default preset: fine-tune)",
-    )
-    parser.add_argument("--cache", type=Path, help="read frames from what `tofcapture pack` wrote")
+    origin = "fine-tune: start from a checkpoint, a run's folder, or 'bundled' (default preset: fine-tune)"
+    add("--from", dest="start", metavar="WEIGHTS", help=origin)
+    add("--cache", type=Path, help="read frames from what `tofcapture pack` wrote")
     _device(parser)
 
 
@@ -117,17 +109,10 @@ def _config(args: argparse.Namespace) -> Config:
     return config if args.seed is None else replace(config, training=replace(config.training, seed=args.seed))
 
 
-def _start(name: str | None) -> Path | None:
-    if name is None:
-        return None
-    from tofcapture_model.training.checkpoint import find_model
-
-    return find_model(None if name == "bundled" else Path(name))
-
-
 def _train(args: argparse.Namespace) -> Outcome:
     config = _config(args)
     _share_cores()
+    from tofcapture_model.networks.checkpoint import find_model
     from tofcapture_model.training.train import train
 
     with progress() as report:
@@ -140,39 +125,28 @@ def _train(args: argparse.Namespace) -> Outcome:
             device=_checked_device(args.device),
             workers=args.workers,
             cache=args.cache,
-            start=_start(args.start),
+            start=None if args.start is None else find_model(None if args.start == "bundled" else args.start),
             also=args.dataset[1:],
             report=report,
         )
-    data: dict[str, Any] = {
-        "weights": str(done.path),
-        "steps": done.steps,
-        "finished": done.finished,
-        "losses": done.losses,
-    }
-    return Outcome(
-        data,
-        f"{done.path}: trained for {done.steps} steps\n  next: tofcapture evaluate {args.dataset[0]} --weights {args.out}",
-    )
+    data = {"weights": str(done.path), "steps": done.steps, "finished": done.finished, "losses": done.losses}
+    following = f"tofcapture evaluate {args.dataset[0]} --weights {args.out}"
+    return Outcome(data, f"{done.path}: trained for {done.steps} steps\n  next: {following}")
 
 
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", type=Path, help="folder that build-dataset wrote")
-    parser.add_argument(
-        "--weights",
-        nargs="+",
-        metavar="[NAME=]PATH",
-        help="checkpoint or folder of a run (default: the bundled weights); with --suite, NAME=PATH of several (default: bundled)",
+    add = parser.add_argument
+    add("dataset", type=Path, help="folder that build-dataset wrote")
+    weights = (
+        "checkpoint or folder of a run (default: the bundled weights); with --suite, NAME=PATH of several"
     )
-    parser.add_argument(
-        "--suite",
-        choices=(*SUITES, "all"),
-        help="tables of several methods, written beside --out (docs/network.md); a killed one goes on",
-    )
-    parser.add_argument("--scenes", default="", help="only scenes whose name begins so")
-    parser.add_argument("--out", type=Path, default=Path("results.json"), help="default: results.json")
-    parser.add_argument("--split", choices=("train", "val", "test"), default="test", help="default: test")
-    parser.add_argument(
+    add("--weights", nargs="+", metavar="[NAME=]PATH", help=weights)
+    suites = "tables of several methods, written beside --out (docs/network.md); a killed one goes on"
+    add("--suite", choices=(*SUITES, "all"), help=suites)
+    add("--scenes", default="", help="only scenes whose name begins so")
+    add("--out", type=Path, default=Path("results.json"), help="default: results.json")
+    add("--split", choices=("train", "val", "test"), default="test", help="default: test")
+    add(
         "--frames",
         type=_not_negative,
         help="frames of every view; 0 takes all (default: 1, with --suite all)",
@@ -196,7 +170,7 @@ def _evaluate(args: argparse.Namespace) -> Outcome:
             frames=1 if args.frames is None else args.frames,
             scenes=args.scenes,
             device=_checked_device(args.device),
-            progress=lambda done, total: report("evaluate", done / total),
+            progress=lambda done, total: report("evaluate", done, total),
         )
     return Outcome({**results, "results": str(args.out)}, f"{comparison(results)}\n{args.out}")
 
@@ -230,7 +204,7 @@ def _no_going_on() -> Iterator[None]:
 def _suite(args: argparse.Namespace) -> Outcome:
     from tofcapture_model.evaluation.suite import read_weights, run_suite, seen_before
     from tofcapture_model.evaluation.tables import markdown
-    from tofcapture_model.training.checkpoint import find_model
+    from tofcapture_model.networks.checkpoint import find_model
 
     with progress() as report:
         results = run_suite(
@@ -242,7 +216,7 @@ def _suite(args: argparse.Namespace) -> Outcome:
             frames=args.frames or 0,
             scenes=args.scenes,
             device=_checked_device(args.device),
-            progress=lambda done, total: report("evaluate", done / total),
+            progress=lambda done, total: report("evaluate", done, total),
         )
     names = list(SUITES) if args.suite == "all" else [args.suite]
     text = f"{markdown(results, names)}\n{seen_before(results)}{args.out}"
@@ -250,34 +224,21 @@ def _suite(args: argparse.Namespace) -> Outcome:
 
 
 def _configure_predict(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "input", type=Path, help="view file or shard (.h5), or raw (8, H, W) or (F, 8, H, W) (.npy, .npz)"
-    )
-    parser.add_argument("--out", type=Path, default=Path("prediction"), help="folder (default: prediction)")
-    parser.add_argument(
-        "--weights",
-        type=Path,
-        help="checkpoint, folder of a run, or 'bundled' (default: the bundled weights)",
-    )
-    parser.add_argument("--view", type=int, default=0, help="of a shard (default: 0)")
+    add = parser.add_argument
+    add("input", type=Path, help="view file or shard (.h5), or raw (8, H, W) or (F, 8, H, W) (.npy, .npz)")
+    add("--out", type=Path, default=Path("prediction"), help="folder (default: prediction)")
+    add("--weights", type=Path, help=_WEIGHTS)
+    add("--view", type=int, default=0, help="of a shard (default: 0)")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--frame", type=int, default=0, help="of the burst (default: 0)")
     which.add_argument(
         "--average", action="store_true", help="take the mean of the burst instead of one frame"
     )
-    parser.add_argument("--rig", type=Path, help="rig.toml for an array (default: nominal intrinsics)")
-    parser.add_argument(
-        "--saturation",
-        type=_positive,
-        metavar="COUNTS",
-        help="at which the sensor of an array saturates (default: 4095, 12 bits)",
-    )
-    parser.add_argument(
-        "--backend",
-        choices=("torch", "onnx"),
-        default="torch",
-        help="onnx: the model.onnx beside the weights (default: torch)",
-    )
+    add("--rig", type=Path, help="rig.toml for an array (default: nominal intrinsics)")
+    saturation = "at which the sensor of an array saturates (default: 4095, 12 bits)"
+    add("--saturation", type=_positive, metavar="COUNTS", help=saturation)
+    backend = "onnx: the model.onnx beside the weights (default: torch)"
+    add("--backend", choices=("torch", "onnx"), default="torch", help=backend)
     _device(parser)
 
 
@@ -296,47 +257,43 @@ def _predict(args: argparse.Namespace) -> Outcome:
         backend=args.backend,
         saturation=args.saturation,
     )
-    size = " x ".join(str(n) for n in reversed(result["shape"]))
-    told = result["median_expected_error"] is not None
-    what = "depth, normals and expected error" if told else "depth and normals"
-    text = f"{args.out}: {what} at {size}, {'decoding and network' if args.device != 'cpu' else 'network'} took {result['inference_ms']:.0f} ms"
-    if not told:
-        text += f"\nno expected error: {result['network']} predicts none"
-    if result["filled"]:
-        text += f"\n{result['measured']:.1%} of the pixels were measured, the others filled (measured.npy says which)"
-    if result["assumed"]:
-        text += f"\nassumed: {result['assumed']}; --rig brings those of your camera"
     if result["warning"]:
         print(f"tofcapture: {result['warning']}", file=sys.stderr)
-    return Outcome(result, text)
+    return Outcome(result, _told(result, args.out, args.device))
+
+
+def _told(result: dict[str, Any], out: Path, device: str) -> str:
+    """Say in words what was predicted, how fast, and from what."""
+    size = " x ".join(str(n) for n in reversed(result["shape"]))
+    errors = result["median_expected_error"] is not None
+    what = "depth, normals and expected error" if errors else "depth and normals"
+    timed = "network" if device == "cpu" else "decoding and network"
+    lines = [f"{out}: {what} at {size}, {timed} took {result['inference_ms']:.0f} ms"]
+    if not errors:
+        lines.append(f"no expected error: {result['network']} predicts none")
+    if result["filled"]:
+        lines.append(
+            f"{result['measured']:.1%} of the pixels were measured, the others filled (measured.npy says which)"
+        )
+    if result["assumed"]:
+        lines.append(f"assumed: {result['assumed']}; --rig brings those of your camera")
+    return "\n".join(lines)
 
 
 def _configure_export(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--weights",
-        type=Path,
-        help="checkpoint, folder of a run, or 'bundled' (default: the bundled weights)",
-    )
-    parser.add_argument(
-        "--out", type=Path, help="default: beside the weights, or here for the bundled ones, .onnx or .pt2"
-    )
-    parser.add_argument(
-        "--format", choices=("onnx", "torch"), default="onnx", help="torch: torch.export (default: onnx)"
-    )
-    parser.add_argument(
-        "--size",
-        type=_count,
-        nargs=2,
-        metavar=("HEIGHT", "WIDTH"),
-        default=(180, 240),
-        help="of the sensor (default: 180 240)",
-    )
+    add = parser.add_argument
+    add("--weights", type=Path, help=_WEIGHTS)
+    add("--out", type=Path, help="default: beside the weights, or here for the bundled ones, .onnx or .pt2")
+    kinds = "torch: torch.export (default: onnx)"
+    add("--format", choices=("onnx", "torch"), default="onnx", help=kinds)
+    size = "of the sensor (default: 180 240)"
+    add("--size", type=_count, nargs=2, metavar=("HEIGHT", "WIDTH"), default=(180, 240), help=size)
 
 
 def _export(args: argparse.Namespace) -> Outcome:
     _share_cores()
     from tofcapture_model.inference.export import SUFFIX, export
-    from tofcapture_model.training.checkpoint import find_model, names_bundled
+    from tofcapture_model.networks.checkpoint import find_model, names_bundled
 
     # the bundled weights are no place to write to
     beside = Path("model") if names_bundled(args.weights) else find_model(args.weights)
@@ -352,9 +309,7 @@ def _configure_report(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dataset", type=Path, help="folder that build-dataset wrote")
     parser.add_argument("--results", type=Path, help="results.json of evaluate")
     parser.add_argument("--evidence", type=Path, help="evidence.json of align")
-    parser.add_argument(
-        "--weights", type=Path, help="checkpoint or folder of a run (default: the bundled weights)"
-    )
+    parser.add_argument("--weights", type=Path, help=_WEIGHTS)
     parser.add_argument("--out", type=Path, default=Path("report.html"), help="default: report.html")
 
 

@@ -1,7 +1,7 @@
-"""What a training run is told: frozen dataclasses, TOML files that hold only differences from a preset.
+"""Configure a training run: frozen dataclasses, and TOML files that hold only differences from a preset.
 
-``preset = "compact"`` in a TOML file names its starting point; a preset itself is a TOML file in ``presets/`` that differs
-from the defaults below, which are the paper's.
+``preset = "compact"`` in a TOML file names its starting point. A preset is a TOML file in ``presets/`` that differs from the
+defaults below, which are the paper's.
 """
 
 from __future__ import annotations
@@ -28,6 +28,10 @@ def _require(fine: bool, where: str, expected: str, got: object) -> None:
         )
 
 
+def _require_one(known: tuple[str, ...], where: str, got: str) -> None:
+    _require(got in known, where, " or ".join(known), got)
+
+
 @dataclass(frozen=True)
 class Network:
     """Which network.
@@ -36,8 +40,7 @@ class Network:
     ----------
     kind
         ``paper``: three U-Nets; ``compact``: one small U-Net with three heads on classical features; ``su2018``, ``guo2018``,
-        ``coarse-fine``: published networks (:mod:`tofcapture_model.networks.baselines`), of which ``su2018`` has a width and none has
-        any of the other keys.
+        ``coarse-fine``: published networks, of which ``su2018`` has a width and none has any of the other keys.
     width, levels
         Channels of the first level and number of levels of every U-Net.
     inputs
@@ -63,39 +66,19 @@ class Network:
     refine_radius: int = 2
 
     def __post_init__(self) -> None:
-        _require(self.kind in OURS + BASELINES, "network.kind", ", ".join(OURS + BASELINES), self.kind)
-        _require(
-            self.width > 0 and 2 <= self.levels <= 6,
-            "network",
-            "width > 0, 2 to 6 levels",
-            (self.width, self.levels),
-        )
-        _require(
-            set(self.inputs) <= set(SOURCES) and len(self.inputs) > 0,
-            "network.inputs",
-            "some of raw, confidence, depth",
-            self.inputs,
-        )
-        compact = self.kind == "compact"
-        _require(
-            not compact or set(self.inputs) == set(SOURCES),
-            "network.inputs",
-            "all of them for compact",
-            self.inputs,
-        )
-        _require(
-            all(w > 0 for w in self.windows) and (len(self.windows) > 0 or not compact),
-            "network.windows",
-            "positive radii, for compact one at least",
-            self.windows,
-        )
+        kinds, sources, compact = OURS + BASELINES, set(self.inputs), self.kind == "compact"
+        _require(self.kind in kinds, "network.kind", ", ".join(kinds), self.kind)
+        fine = self.width > 0 and 2 <= self.levels <= 6
+        _require(fine, "network", "width > 0, 2 to 6 levels", (self.width, self.levels))
+        fine = bool(sources) and sources <= set(SOURCES)
+        _require(fine, "network.inputs", "some of raw, confidence, depth", self.inputs)
+        fine = not compact or sources == set(SOURCES)
+        _require(fine, "network.inputs", "all of them for compact", self.inputs)
+        fine = all(w > 0 for w in self.windows) and (len(self.windows) > 0 or not compact)
+        _require(fine, "network.windows", "positive radii, for compact one at least", self.windows)
         _require(self.max_residual >= 0, "network.max_residual", "metres >= 0", self.max_residual)
-        _require(
-            self.refine_iterations >= 0 and self.refine_radius > 0,
-            "network.refine",
-            "iterations >= 0, radius > 0",
-            (self.refine_iterations, self.refine_radius),
-        )
+        refine = (self.refine_iterations, self.refine_radius)
+        _require(min(*refine, 0) == 0 < refine[1], "network.refine", "iterations >= 0, radius > 0", refine)
 
 
 @dataclass(frozen=True)
@@ -111,8 +94,8 @@ class Losses:
     reweight
         Whether eq. 1 weighs pixels by lambda; false: plain smooth l1.
     uncertainty
-        What the error map learns: ``l1``, the expected absolute error (paper), or ``laplace``, the scale of a Laplace
-        distribution, which is then calibrated on the ``val`` split to be one sigma.
+        What the error map learns: ``l1``, the expected absolute error (paper), or ``laplace``, a Laplace distribution's scale,
+        which is then calibrated on the ``val`` split to be one sigma.
     normals
         Distance of normals: ``cosine``, eq. 3 (paper), or ``angle``, whose gradient does not fade with the angle.
     depth, chamfer, error, normal
@@ -139,27 +122,15 @@ class Losses:
     context: float = 0.0
 
     def __post_init__(self) -> None:
-        _require(
-            self.delta > 0 and self.jitter >= 0, "losses", "delta > 0, jitter >= 0", (self.delta, self.jitter)
-        )
-        _require(
-            self.uncertainty in ("l1", "laplace"), "losses.uncertainty", "l1 or laplace", self.uncertainty
-        )
-        _require(
-            self.chamfer_distance in ("point", "plane"),
-            "losses.chamfer_distance",
-            "point or plane",
-            self.chamfer_distance,
-        )
+        fine = self.delta > 0 and self.jitter >= 0
+        _require(fine, "losses", "delta > 0, jitter >= 0", (self.delta, self.jitter))
+        _require_one(("l1", "laplace"), "losses.uncertainty", self.uncertainty)
+        _require_one(("point", "plane"), "losses.chamfer_distance", self.chamfer_distance)
+        _require_one(("cosine", "angle"), "losses.normals", self.normals)
         _require(self.chamfer_softness >= 0, "losses.chamfer_softness", "mm^2 >= 0", self.chamfer_softness)
-        _require(self.normals in ("cosine", "angle"), "losses.normals", "cosine or angle", self.normals)
         weights = (self.depth, self.chamfer, self.error, self.normal)
-        _require(
-            min(*weights, self.context) >= 0 and max(weights) > 0,
-            "losses",
-            "weights >= 0, one of depth, chamfer, error, normal above",
-            self,
-        )
+        fine = min(*weights, self.context) >= 0 and max(weights) > 0
+        _require(fine, "losses", "weights >= 0, one of depth, chamfer, error, normal above", self)
 
 
 @dataclass(frozen=True)
@@ -172,12 +143,8 @@ class Stage:
 
     def __post_init__(self) -> None:
         _require(self.name in STAGES, "stage.name", ", ".join(STAGES), self.name)
-        _require(
-            self.epochs > 0 and self.learning_rate > 0,
-            f"stage {self.name}",
-            "epochs and learning_rate > 0",
-            self,
-        )
+        fine = self.epochs > 0 and self.learning_rate > 0
+        _require(fine, f"stage {self.name}", "epochs and learning_rate > 0", self)
 
 
 @dataclass(frozen=True)
@@ -193,11 +160,10 @@ class Training:
     frames
         Use the first so many frames of every view; 0: all. Frames of a view differ in noise only, and each is decoded once.
     noise
-        ``recorded``: frames as they were taken; ``drawn``: the mean of each view's frames with fresh shot and read noise, drawn on
-        the training device, so that no frame is ever seen twice.
+        ``recorded``: frames as they were taken; ``drawn``: the mean of each view's frames with fresh shot and read noise, so
+        that no frame is ever seen twice.
     phase_error
-        Radians; above 0 every crop is given an error of calibration of its own, offset and wiggling of each frequency, as another
-        camera of the make would have (:func:`tofcapture_model.data.augment.redraw_calibration`).
+        Radians; above 0 every crop is given an error of calibration of its own, as another camera of the make would have.
     flip
         Mirror frames at random: right as far as the light source stands near the lens.
     schedule
@@ -226,25 +192,14 @@ class Training:
 
     def __post_init__(self) -> None:
         _require(self.batch > 0, "training.batch", "> 0", self.batch)
-        _require(
-            self.precision in ("float32", "bfloat16"),
-            "training.precision",
-            "float32 or bfloat16",
-            self.precision,
-        )
-        _require(self.noise in ("recorded", "drawn"), "training.noise", "recorded or drawn", self.noise)
+        _require_one(("float32", "bfloat16"), "training.precision", self.precision)
+        _require_one(("recorded", "drawn"), "training.noise", self.noise)
+        _require_one(("constant", "cosine"), "training.schedule", self.schedule)
         for key in ("frames", "validate_every", "seed"):
             _require(getattr(self, key) >= 0, f"training.{key}", ">= 0", getattr(self, key))
         _require(0 <= self.phase_error < 0.5, "training.phase_error", "radians, 0 to 0.5", self.phase_error)
-        _require(
-            len(self.crop) in (0, 2) and all(c >= 32 for c in self.crop),
-            "training.crop",
-            "[] or [height, width] >= 32",
-            self.crop,
-        )
-        _require(
-            self.schedule in ("constant", "cosine"), "training.schedule", "constant or cosine", self.schedule
-        )
+        fine = len(self.crop) in (0, 2) and all(c >= 32 for c in self.crop)
+        _require(fine, "training.crop", "[] or [height, width] >= 32", self.crop)
 
 
 PAPER_STAGES = (Stage("depth", 230), Stage("normal", 460), Stage("refine", 5))
@@ -290,7 +245,7 @@ def _changed(part: Part, table: Any, where: str) -> Part:
 
 
 def _typed(raw: Any, hint: Any, where: str) -> Any:
-    """Check a TOML value against a field's type: int, float (whole numbers, too, but finite), bool, str, or a tuple of one of them."""
+    """Check a TOML value against a field's type: int, finite float, bool, str, or a tuple of one of them."""
     of = get_args(hint)  # tuple[int, ...]
     if of:
         if not isinstance(raw, list):
@@ -320,11 +275,10 @@ def config_from_dict(table: Mapping[str, Any], where: str = "config") -> Config:
         if not isinstance(table["stage"], list):
             raise ConfigError(f"{where}: stage: expected tables [[stage]], got {table['stage']!r}")
         for i, stage in enumerate(table["stage"]):
-            if not isinstance(stage, Mapping) or "name" not in stage or "epochs" not in stage:
+            if not isinstance(stage, Mapping) or not {"name", "epochs"} <= stage.keys():
                 raise ConfigError(f"{where}: stage {i}: expected name and epochs, got {stage!r}")
-        stages = tuple(
-            _changed(Stage("joint", 1), s, f"{where}: stage {i}") for i, s in enumerate(table["stage"])
-        )
+        given = enumerate(table["stage"])
+        stages = tuple(_changed(Stage("joint", 1), s, f"{where}: stage {i}") for i, s in given)
     parts = {
         name: _changed(getattr(base, name), table.get(name, {}), f"{where}: {name}")
         for name in ("network", "losses", "training")

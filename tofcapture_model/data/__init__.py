@@ -1,0 +1,397 @@
+"""Samples of a dataset: one frame of one view, decoded as a network reads it, with its ground truth at twice the resolution."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from tofcapture.camera import Camera
+from tofcapture.errors import ConfigError, DataError
+from tofcapture.files.cache import open_cache
+from tofcapture.files.layout import MaskBit
+from tofcapture.files.manifest import load_manifest
+from tofcapture.files.packed import PackedScene
+from tofcapture.files.shard import ShardReader
+from tofcapture.frames import TofInfo
+from tofcapture.ops.phase import Decoder, TapNoise, frequencies, photon_transfer
+from tofcapture.ops.phase.float32 import tap_weights
+from tofcapture_model.data.augment import BurstNoise
+from tofcapture_model.data.raw_input import taken
+from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, NO_MAPS, Frame, Target
+from tofcapture_model.geometry.intrinsics import (
+    cut_intrinsics,
+    expect_usable,
+    intrinsics_of,
+    mirror_intrinsics,
+    with_lens,
+)
+from tofcapture_model.geometry.multipath import cues
+
+Float32 = NDArray[np.float32]
+Reader = ShardReader | PackedScene
+MODEST = 1.5e9  # bytes, where the system does not tell what it has
+TABLES = 110  # bytes per pixel of a decoder and its camera's rays, one for each scene
+_MEASURED = 16  # scenes whose first burst the noise is measured on
+
+
+@dataclass(frozen=True)
+class SampleId:
+    """Which frame: scene name, view, frame."""
+
+    scene: str
+    view: int
+    frame: int
+
+
+def fill_nearest(image: Float32, valid: NDArray[np.bool_]) -> Float32:
+    """Give every pixel outside ``valid`` the value of the nearest pixel inside; 1 m where nothing is valid at all."""
+    from scipy.ndimage import distance_transform_edt
+
+    if not valid.any():
+        return np.ones_like(image)
+    if valid.all():
+        return image
+    rows, cols = distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    out: Float32 = image[rows, cols]
+    return out
+
+
+def frame_decoder(info: TofInfo, camera: Camera) -> Decoder:
+    """Build the tables of :func:`make_frame` for calibrated intrinsics; refuses a lens that cannot be used."""
+    expect_usable(camera)
+    return Decoder(replace(info, camera=camera))
+
+
+def make_frame(
+    raw: NDArray[Any],
+    info: TofInfo,
+    camera: Camera,
+    celsius: float = float("nan"),
+    decoder: Decoder | None = None,
+) -> Frame:
+    """Decode one raw frame into what a network reads, as tensors without a batch axis.
+
+    Parameters
+    ----------
+    raw
+        (K, H, W) as the sensor gave it, or the mean of some frames.
+    info
+        Channel order, saturation, light source, range errors.
+    camera
+        Intrinsics of the ToF camera.
+    celsius
+        Sensor temperature; NaN: unknown.
+    decoder
+        :func:`frame_decoder` of the same camera; ``None`` builds its tables anew, which takes as long as some frames.
+    """
+    maps, signals = (decoder or frame_decoder(info, camera)).signals(raw, celsius)
+    depth, hz = maps.depth, frequencies(info.modulation_hz)
+    valid = np.isfinite(depth) & (depth > MIN_RANGE) & (depth < MAX_RANGE)
+    frame = Frame(
+        raw=_tensor(raw) / info.saturation,
+        phasor=_tensor(signals.phasor.reshape(4, *depth.shape)) / info.saturation,
+        depth=_tensor(fill_nearest(depth, valid)[None]),
+        valid=_tensor(valid[None]),
+        confidence=_tensor(maps.confidence[None]) / info.saturation,
+        gap=_tensor(np.nan_to_num(signals.gap[None])),
+        cues=torch.empty(0),
+        modulation=torch.tensor(hz, dtype=torch.float32),
+        intrinsics=intrinsics_of(camera),
+        demodulation=_tensor(tap_weights(info)[[0, 2, 1, 3]]),
+    )
+    return frame._replace(cues=with_cues(batched(frame), hz[1]).cues[0])
+
+
+def with_cues(frame: Frame, hz: float) -> Frame:
+    """Add the cues to a batch of decoded frames, on its device; ``hz`` is the high frequency."""
+    return frame._replace(cues=cues(frame.phasor, frame.depth, frame.valid, frame.gap, frame.intrinsics, hz))
+
+
+def batched(frame: Frame) -> Frame:
+    """Give a single frame its batch axis."""
+    return Frame(*(x[None] for x in frame))
+
+
+def _tensor(array: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+
+
+def make_target(depth: Float32, normals: Float32, mask: NDArray[np.uint8]) -> Target:
+    """Turn ground truth (2H, 2W), (2H, 2W, 3), (2H, 2W) into tensors; what is missing becomes finite and is masked."""
+    hit = np.isfinite(depth) & np.isfinite(normals).all(-1)
+    good, context = (mask == 0) & hit, (mask == MaskBit.OUTSIDE) & hit
+    return Target(
+        depth=_tensor(np.where(hit, depth, 1.0)[None]),
+        normals=_tensor(np.where(hit[..., None], normals, [0.0, 0.0, -1.0]).transpose(2, 0, 1)),
+        good=torch.from_numpy(good[None]),
+        context=torch.from_numpy(context[None]),
+    )
+
+
+def crop(frame: Frame, target: Target, top: int, left: int, size: tuple[int, int]) -> tuple[Frame, Target]:
+    """Cut a window out of a frame and its target; the principal point moves with it."""
+    rows, cols = slice(top, top + size[0]), slice(left, left + size[1])
+    rows2, cols2 = slice(2 * top, 2 * (top + size[0])), slice(2 * left, 2 * (left + size[1]))
+    maps = {k: v[..., rows, cols] for k, v in frame._asdict().items() if k not in NO_MAPS}
+    cut = frame._replace(**maps, intrinsics=cut_intrinsics(frame.intrinsics, top, left))
+    return cut, Target(*(x[..., rows2, cols2] for x in target))
+
+
+def mirror(frame: Frame, target: Target, axis: int = -1) -> tuple[Frame, Target]:
+    """Flip left and right (axis -1) or up and down (axis -2): images, camera, and that component of the normals."""
+    maps = {k: v.flip(axis) for k, v in frame._asdict().items() if k not in NO_MAPS}
+    intrinsics = mirror_intrinsics(frame.intrinsics, axis, frame.depth.shape[axis])
+    sign = torch.ones(3, 1, 1)
+    sign[-1 - axis] = -1  # x for columns, y for rows
+    flipped = Target(*(x.flip(axis) for x in target))
+    return frame._replace(**maps, intrinsics=intrinsics), flipped._replace(normals=flipped.normals * sign)
+
+
+def open_scenes(folder: Path, split: str, cache: Path | None = None) -> dict[str, Reader]:
+    """Open a split's scenes, by name: shards, or a cache that must still agree with them. Readers pickle as paths.
+
+    Raises
+    ------
+    DataError
+        The manifest or the cache is missing or damaged, the cache is stale or of another split.
+    """
+    entries = load_manifest(folder).split(split)
+    if cache is None:
+        return {name: ShardReader(Path(folder) / entry.path, entry.sha256) for name, entry in entries.items()}
+    packed = open_cache(cache, folder)
+    if packed.keys() != entries.keys():
+        raise DataError(
+            f"{cache}: is not of the split {split}", hint=f"tofcapture pack {folder} --split {split}"
+        )
+    return dict(packed)
+
+
+class FrameDataset(Dataset[tuple[Frame, Target]]):
+    """All frames of a split of a dataset.
+
+    An item is asked for by ``(epoch, i)``: crop and flip are drawn from ``(seed, epoch, i)``. So an interrupted run goes on with
+    the very same samples, whatever the number of workers.
+
+    Parameters
+    ----------
+    folder
+        The dataset, or several.
+    split
+        ``train``, ``val`` or ``test``.
+    size
+        (height, width) of crops at sensor resolution; () gives whole frames.
+    flip
+        Mirror half of the items, left to right.
+    seed
+        Of crops and flips.
+    frames
+        Use only the first so many frames of every view; 0: all.
+    mean
+        One item per view, the mean of its frames, for noise that is drawn again as ``burst`` says.
+    cache_bytes
+        Decoded frames and their ground truth are kept in memory up to this size.
+    cache
+        Folder that ``tofcapture pack`` filled with this split of the one dataset; ``None`` reads the shards.
+
+    Raises
+    ------
+    DataError
+        The split is empty, its frames make no batch, or a cache is not of it.
+    ConfigError
+        A cache with several datasets, or noise to be drawn of cameras that saturate differently.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path | Sequence[Path],
+        split: str,
+        size: Sequence[int] = (),
+        *,
+        flip: bool = False,
+        seed: int = 0,
+        frames: int = 0,
+        mean: bool = False,
+        cache_bytes: float = 0,
+        cache: Path | None = None,
+    ) -> None:
+        folders = [Path(folder)] if isinstance(folder, str | Path) else list(folder)
+        if cache and len(folders) > 1:
+            raise ConfigError(
+                f"expected one dataset with the cache {cache}, got {len(folders)}",
+                hint="leave the cache away: frames are kept in memory as far as it goes",
+            )
+        self.readers = {
+            f"{name} ({k + 1})" if k else name: reader  # datasets may use a name twice
+            for k, one in enumerate(folders)
+            for name, reader in open_scenes(one, split, cache).items()
+        }
+        if not self.readers:
+            raise DataError(
+                f"{', '.join(map(str, folders))}: the split {split} is empty",
+                hint="record more scenes, or choose another --split",
+            )
+        self.size, self.flip, self.seed, self.mean = tuple(size), flip, seed, mean
+        _expect_alike(self.readers, self.size)
+        least = min(reader.frames for reader in self.readers.values())
+        self.averaged = min(least, frames or least) if mean else 1  # frames of an item
+        self.samples = [
+            SampleId(name, view, frame)
+            for name, reader in self.readers.items()
+            for view in range(reader.views)
+            for frame in range(1 if mean else min(frames or reader.frames, reader.frames))
+        ]
+        self.burst = _burst_noise(self.readers, self.averaged) if mean else None
+        cameras = [reader.camera for reader in self.readers.values()]
+        self._lens = any(camera.distortion for camera in cameras)
+        self._room = cache_bytes - sum(TABLES * camera.width * camera.height for camera in cameras)
+        self._frames: dict[SampleId, Frame] = {}
+        self._targets: dict[tuple[str, int], Target] = {}
+        self._decoders: dict[str, Decoder] = {}
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, key: tuple[int, int]) -> tuple[Frame, Target]:
+        epoch, i = key
+        sample = self.samples[i]
+        frame, target = self.frame(sample), self.target(sample)
+        rng = np.random.default_rng([self.seed, epoch, i])
+        if self.size:
+            frame, target = self._cropped(frame, target, rng)
+        if self.flip and rng.random() < 0.5:
+            frame, target = mirror(frame, target)
+        return frame, target
+
+    def frame(self, sample: SampleId) -> Frame:
+        """Decode a frame, whole."""
+        if sample in self._frames:
+            return self._frames[sample]
+        reader = self.readers[sample.scene]
+        shots = range(self.averaged) if self.mean else [sample.frame]
+        celsius = np.array([reader.celsius(sample.view, f) for f in shots])
+        burst = np.stack([reader.raw(sample.view, f) for f in shots])
+        raw, temperature = taken(burst, None if self.mean else 0, reader.info.saturation, celsius)
+        if sample.scene not in self._decoders:
+            self._decoders[sample.scene] = frame_decoder(reader.info, reader.camera)
+        frame = make_frame(raw, reader.info, reader.camera, temperature, self._decoders[sample.scene])
+        if self._lens:  # a batch may hold frames of other cameras, without one
+            frame = frame._replace(intrinsics=with_lens(frame.intrinsics))
+        if self._take_room(frame):
+            self._frames[sample] = frame
+        return frame
+
+    def target(self, sample: SampleId) -> Target:
+        """Read the ground truth of a frame's view, whole."""
+        key = (sample.scene, sample.view)
+        if key in self._targets:
+            return self._targets[key]
+        gt = self.readers[sample.scene].ground_truth(sample.view, 2)
+        target = make_target(gt.depth, gt.normals, gt.mask)
+        if self._take_room(target):
+            self._targets[key] = target
+        return target
+
+    def close(self) -> None:
+        """Close the shards."""
+        for reader in self.readers.values():
+            reader.close()
+
+    def _take_room(self, tensors: Iterable[Tensor]) -> bool:
+        size = sum(x.nbytes for x in tensors)
+        if size > self._room:
+            return False
+        self._room -= size
+        return True
+
+    def _cropped(self, frame: Frame, target: Target, rng: np.random.Generator) -> tuple[Frame, Target]:
+        """Crop about a pixel of good ground truth, because most of an image is background."""
+        h, w = frame.depth.shape[-2:]
+        size = (min(self.size[0], h), min(self.size[1], w))
+        good = target.good[0, ::8, ::8].nonzero()
+        at = np.array([rng.integers(h), rng.integers(w)])
+        if len(good):
+            at = good[int(rng.integers(len(good)))].numpy() * 4 + rng.integers(-16, 17, 2)
+        top, left = (int(np.clip(a - s // 2, 0, n - s)) for a, s, n in zip(at, size, (h, w), strict=True))
+        return crop(frame, target, top, left, size)
+
+
+def _expect_alike(readers: Mapping[str, Reader], size: tuple[int, ...]) -> None:
+    """Refuse frames that make no batch: other numbers of phases, other sizes unless crops of ``size`` fit into all."""
+    kinds: dict[tuple[int, ...], str] = {}
+    for name, reader in readers.items():
+        whole = (len(reader.info.modulation_hz), *reader.camera.shape)
+        shape = [min(n, s) for n, s in zip(whole[1:], size or whole[1:], strict=True)]
+        kinds.setdefault((whole[0], *shape), f"{name}, {' x '.join(map(str, whole))}")
+    if len(kinds) > 1:
+        raise DataError(
+            f"expected frames of one kind, got {' and '.join(kinds.values())}",
+            hint="train on them apart, or with a training.crop that fits into all",
+        )
+
+
+def _burst_noise(readers: Mapping[str, Reader], frames: int) -> BurstNoise:
+    """Measure the noise of the frames that a mean of ``frames`` stands for, on bursts of some scenes."""
+    saturations = {reader.info.saturation for reader in readers.values()}
+    if len(saturations) > 1:
+        raise ConfigError(
+            f"training.noise = drawn: expected cameras that saturate alike, got {', '.join(f'{s:g}' for s in sorted(saturations))}",
+            hint='train on them apart, or with training.noise = "recorded"',
+        )
+    some = [readers[name] for name in sorted(readers)][:: -(-len(readers) // _MEASURED)]
+    bursts = (np.stack([reader.raw(0, f) for f in range(frames)]) for reader in some)
+    full_scale = saturations.pop()
+    return BurstNoise(frames, photon_transfer(bursts, full_scale) if frames > 1 else TapNoise(), full_scale)
+
+
+def spare_memory() -> float:
+    """Bytes that decoded frames may take: half of what system and container spare, shared by torchrun's processes."""
+    processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    try:
+        told = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        spare = 1024.0 * int(told["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        return MODEST / processes
+    group = Path("/sys/fs/cgroup")
+    with suppress(OSError, ValueError):  # no limit reads "max"
+        limit = int((group / "memory.max").read_text())
+        spare = min(spare, limit - int((group / "memory.current").read_text()))
+    return max(spare, 0.0) / 2 / processes
+
+
+def collate(items: Sequence[tuple[Frame, Target]]) -> tuple[Frame, Target]:
+    """Stack items along a new first axis; images in channels-last memory order."""
+    frames, targets = zip(*items, strict=True)
+    frame = Frame(*(torch.stack(x) for x in zip(*frames, strict=True)))
+    maps = {
+        k: v.contiguous(memory_format=torch.channels_last)
+        for k, v in frame._asdict().items()
+        if k not in NO_MAPS
+    }
+    return frame._replace(**maps), Target(*(torch.stack(x) for x in zip(*targets, strict=True)))
+
+
+def epoch_batches(
+    count: int, batch: int, seed: int, epoch: int, rank: int = 0, world: int = 1
+) -> list[list[tuple[int, int]]]:
+    """Keys ``(epoch, i)`` of every batch of an epoch, for one of ``world`` processes.
+
+    The order is a permutation drawn from ``(seed, epoch)``. All processes get equally many full batches, so that they step
+    together; fewer samples than one step needs are repeated.
+    """
+    order = np.random.default_rng([seed, epoch]).permutation(count)
+    step = batch * world
+    order = np.resize(order, max(step, count - count % step))
+    return [
+        [(epoch, int(i)) for i in order[s + rank * batch : s + (rank + 1) * batch]]
+        for s in range(0, len(order), step)
+    ]

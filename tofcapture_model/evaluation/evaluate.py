@@ -14,15 +14,13 @@ from torch import Tensor
 from tofcapture.errors import ConfigError
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.seal import PARTIAL, write_text
-from tofcapture_model.data.frame import Frame, frame_to, target_to
-from tofcapture_model.data.frames import FrameDataset, batched
-from tofcapture_model.data.shards import SampleId
+from tofcapture_model.data import FrameDataset, SampleId, batched
 from tofcapture_model.evaluation.metrics import Score
-from tofcapture_model.networks.baselines import sensor
+from tofcapture_model.frame import Frame, frame_to, target_to
+from tofcapture_model.networks import Model
+from tofcapture_model.networks.baselines import sensor_estimate
+from tofcapture_model.networks.checkpoint import find_model, load_model, not_new, origin, sentence
 from tofcapture_model.networks.joint import JointModel
-from tofcapture_model.networks.zoo import Model
-from tofcapture_model.training.checkpoint import find_model, load_model
-from tofcapture_model.training.learned import not_new, origin, sentence
 
 FORMAT, VERSION = "tofcapture-results", 1
 _EVERY = 7  # of how many good pixels a calibration looks at one
@@ -158,7 +156,7 @@ def evaluate(
     model.to(device)
     data = FrameDataset(dataset, split, frames=frames)
     measured = take_scenes(data, split, scenes)
-    methods: dict[str, Method] = {"sensor": sensor.estimate, "model": model_method(model)}
+    methods: dict[str, Method] = {"sensor": sensor_estimate, "model": model_method(model)}
     scores, empty = score(methods, data, torch.device(device), progress)
     reader = next(iter(data.readers.values()))
     results = {
@@ -223,7 +221,7 @@ def take_scenes(data: FrameDataset, split: str, prefix: str) -> list[str]:
 def not_new_of(
     provenance: Mapping[str, Any], dataset: Path, split: str, scenes: Collection[str]
 ) -> dict[str, str] | None:
-    """Of these scenes of a split those that a network has learned from, as :func:`tofcapture_model.training.learned.not_new` says."""
+    """Of these scenes of a split those that a network has learned from, as :func:`tofcapture_model.networks.checkpoint.not_new` says."""
     found = not_new(provenance, dataset, split)
     return None if found is None else {name: why for name, why in found.items() if name in scenes}
 

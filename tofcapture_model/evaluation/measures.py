@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
-from tofcapture_model.data.frame import Frame, Target
+from tofcapture_model.frame import Frame, Target
 from tofcapture_model.geometry.intrinsics import scale_intrinsics
 from tofcapture_model.geometry.maps import unproject
 
@@ -76,7 +76,7 @@ def _dilated(mask: Tensor, reach: int) -> Tensor:
 
 
 def _hit(target: Target) -> Tensor:
-    """Where there is ground truth, masked or not: :func:`tofcapture_model.data.frames.make_target` gives the rest 1 m and (0, 0, -1)."""
+    """Where there is ground truth, masked or not: :func:`tofcapture_model.data.make_target` gives the rest 1 m and (0, 0, -1)."""
     placeholder = (target.depth == 1) & (target.normals[:, 2:] == -1)
     return target.good | target.context | ~placeholder
 

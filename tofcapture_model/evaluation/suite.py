@@ -23,20 +23,17 @@ from tofcapture.errors import ConfigError
 from tofcapture.files.manifest import manifest_path
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Losses
-from tofcapture_model.data.frame import Frame, Target, frame_to, target_to
-from tofcapture_model.data.frames import FrameDataset, batched, spare_memory
+from tofcapture_model.data import FrameDataset, batched, spare_memory
 from tofcapture_model.evaluation.evaluate import expect_writable, not_new_of, take_scenes, write_results
 from tofcapture_model.evaluation.measures import Precision, Uncertainty, regions
 from tofcapture_model.evaluation.metrics import Score
 from tofcapture_model.evaluation.tables import SUITES, write_tables
-from tofcapture_model.networks.baselines import lf2, sensor
-from tofcapture_model.networks.baselines.protocol import Baseline
-from tofcapture_model.networks.zoo import Model
-from tofcapture_model.training.checkpoint import find_model, load_model
-from tofcapture_model.training.learned import origin, sentence
-from tofcapture_model.training.run_card import budget
+from tofcapture_model.frame import Frame, Target, frame_to, target_to
+from tofcapture_model.networks import Model
+from tofcapture_model.networks.baselines import Baseline, lf2, sensor_estimate
+from tofcapture_model.networks.checkpoint import budget, find_model, load_model, origin, sentence
 
-FREE = {"sensor": sensor.estimate, "lf2": lf2.estimate}
+FREE = {"sensor": sensor_estimate, "lf2": lf2.estimate}
 """Methods without parameters; they take part in every suite."""
 
 

@@ -1,7 +1,6 @@
-"""Decoding where the network is: taps to a network's frame in torch, so that on a GPU nothing but the taps is copied.
+"""Decode where the network is: the torch form of :class:`tofcapture.ops.phase.Decoder`, with its tables, for GPUs.
 
-The mathematics of :class:`tofcapture.ops.phase.Decoder`, which is its oracle in the tests, and the nearest measured neighbour for
-holes. No value is looked at on the way and no array comes from the host, so a CUDA graph can hold all of it.
+Only the taps are copied to the device. No value is looked at on the way, so a CUDA graph can hold all of it.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from tofcapture.ops.phase import Decoder, ambiguity, frequencies
 from tofcapture.ops.phase.decoder import UNKNOWN_CELSIUS
 from tofcapture.ops.phase.float32 import Correction, tap_weights
 from tofcapture.rig import RangeError
-from tofcapture_model.data.frame import MAX_RANGE, MIN_RANGE, Frame
+from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
 from tofcapture_model.geometry.intrinsics import expect_usable, intrinsics_of
 
 _HELD = 1 << 25  # elements of the table of distances
@@ -74,7 +73,7 @@ class TorchDecoder:
     Parameters
     ----------
     info, camera
-        As for :func:`tofcapture_model.data.frames.make_frame`.
+        As for :func:`tofcapture_model.data.make_frame`.
     device
         Where taps will be and the frame shall be.
 

@@ -1,7 +1,7 @@
 """A camera as numbers on a device, and the rays of its pixels.
 
-Intrinsics are (B, 4) fx, fy, cx, cy in pixels, pixel centres integers, or (B, 9) where there is a lens: OpenCV's k1, k2, p1, p2, k3
-behind them, as :class:`tofcapture.camera.Camera` has them. Networks see images as the sensor took them; nothing is rectified.
+Intrinsics are (B, 4) fx, fy, cx, cy in pixels, or (B, 9) with OpenCV's k1, k2, p1, p2, k3 of a lens behind them.
+Networks see images as the sensor took them; nothing is rectified.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _INVERTED = 1e-4  # of a ray's x and y at z = 1
 
 
 def intrinsics_of(camera: Camera) -> Tensor:
-    """(4,) float32 of a pinhole, (9,) of a camera with a lens."""
+    """Return (4,) float32 of a pinhole, (9,) of a camera with a lens."""
     return torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 
 def expect_usable(camera: Camera) -> None:
-    """Refuse a lens whose rays the networks would get wrong, at the sensor's resolution or at twice that; takes a fraction of a second.
+    """Refuse a lens whose rays the networks would get wrong, at the sensor's resolution or at twice that.
 
     Raises
     ------
@@ -46,24 +46,24 @@ def expect_usable(camera: Camera) -> None:
 
 
 def with_lens(intrinsics: Tensor) -> Tensor:
-    """Intrinsics (..., 9) of (..., 4): a lens that does nothing, so that cameras with and without one make a batch."""
+    """Add a lens that does nothing, so that cameras with and without one make a batch: (..., 9)."""
     return F.pad(intrinsics, (0, LENS - intrinsics.shape[-1]))
 
 
 def scale_intrinsics(intrinsics: Tensor, s: int) -> Tensor:
-    """Intrinsics (B, 4 or 9) of the same view at ``s`` times the resolution: ``f' = s f``, ``c' = s (c + 0.5) - 0.5``."""
+    """Scale intrinsics (B, 4 or 9) to ``s`` times the resolution: ``f' = s f``, ``c' = s (c + 0.5) - 0.5``."""
     f, c, lens = intrinsics[:, :2], intrinsics[:, 2:PINHOLE], intrinsics[:, PINHOLE:]
     return torch.cat([f * s, (c + 0.5) * s - 0.5, lens], dim=1)
 
 
 def thin_intrinsics(intrinsics: Tensor, step: int) -> Tensor:
-    """Intrinsics (B, 4 or 9) of every ``step``-th pixel, from pixel ``step // 2`` on."""
+    """Take every ``step``-th pixel, from pixel ``step // 2`` on; intrinsics (B, 4 or 9)."""
     f, c, lens = intrinsics[:, :2], intrinsics[:, 2:PINHOLE], intrinsics[:, PINHOLE:]
     return torch.cat([f / step, (c - step // 2) / step, lens], dim=1)
 
 
 def cut_intrinsics(intrinsics: Tensor, top: int, left: int) -> Tensor:
-    """Intrinsics (..., 4 or 9) of a window at (top, left): the principal point moves."""
+    """Cut a window at (top, left) out of the image; intrinsics (..., 4 or 9)."""
     moved = intrinsics.clone()
     moved[..., 2] -= left
     moved[..., 3] -= top
@@ -71,22 +71,16 @@ def cut_intrinsics(intrinsics: Tensor, top: int, left: int) -> Tensor:
 
 
 def mirror_intrinsics(intrinsics: Tensor, axis: int, size: int) -> Tensor:
-    """Intrinsics (..., 4 or 9) of images of ``size`` pixels along ``axis``, flipped there: -1 left and right, -2 up and down.
-
-    The radial distortion stays as it is. Of the tangential one ``p2`` changes sign with x, ``p1`` with y.
-    """
+    """Mirror images of ``size`` pixels along ``axis``: -1 left and right, -2 up and down; intrinsics (..., 4 or 9)."""
     flipped, component = intrinsics.clone(), -1 - axis
     flipped[..., 2 + component] = size - 1 - flipped[..., 2 + component]
     if intrinsics.shape[-1] == LENS:
-        flipped[..., 7 - component] *= -1
+        flipped[..., 7 - component] *= -1  # of the tangential distortion p2 changes sign with x, p1 with y
     return flipped
 
 
 def rays(intrinsics: Tensor, height: int, width: int) -> Tensor:
-    """(B, 3, H, W) rays through the pixel centres with z = 1, from intrinsics (B, 4 or 9).
-
-    A lens is inverted by Newton's method in the given dtype, inside the image only: :func:`expect_usable` makes sure of it.
-    """
+    """Return rays (B, 3, H, W) through the pixel centres, z = 1; a lens is inverted by Newton's method, inside the image only."""
     fx, fy, cx, cy = (intrinsics[:, i, None, None] for i in range(PINHOLE))
     v, u = torch.meshgrid(
         torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device),
@@ -100,7 +94,7 @@ def rays(intrinsics: Tensor, height: int, width: int) -> Tensor:
 
 
 def pixel_slopes(intrinsics: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Derivatives du/dx, du/dy, dv/dx, dv/dy, in pixels, of the image at rays (x, y, 1): each (B, H, W), or (B, 1, 1) of a pinhole."""
+    """Return du/dx, du/dy, dv/dx, dv/dy in pixels at rays (x, y, 1): each (B, H, W), or (B, 1, 1) of a pinhole."""
     fx, fy = intrinsics[:, 0, None, None], intrinsics[:, 1, None, None]
     if intrinsics.shape[1] == PINHOLE:
         return fx, torch.zeros_like(fx), torch.zeros_like(fy), fy
@@ -109,7 +103,7 @@ def pixel_slopes(intrinsics: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tens
 
 
 def _distorted(intrinsics: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Distorted x and y, and the derivative, which is symmetric: of x along x, of either along the other, of y along y."""
+    """Distort x and y; with the derivative, which is symmetric: of x along x, of either along the other, of y along y."""
     k1, k2, p1, p2, k3 = (intrinsics[:, i, None, None] for i in range(PINHOLE, LENS))
     r2 = x * x + y * y
     radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))

@@ -1,8 +1,7 @@
 """Depth, rays and normals on the image grid, differentiable.
 
-Depth is z in metres, normals are unit and face the camera (``n . p < 0``), images are (B, C, H, W), pixel centres integers, intrinsics
-(B, 4) or, with a lens, (B, 9): :mod:`tofcapture_model.geometry.intrinsics`.
-All functions keep the dtype they are given; the project calls them in float32.
+Depth is z in metres, normals are unit and face the camera, images are (B, C, H, W), intrinsics (B, 4 or 9).
+All functions keep the dtype they are given.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture.rig import SPEED_OF_LIGHT
-from tofcapture_model.data.frame import Frame
+from tofcapture_model.frame import Frame
 from tofcapture_model.geometry.intrinsics import PINHOLE, pixel_slopes, rays
 
 _TINY = 1e-12
@@ -24,7 +23,7 @@ _FAINT = 1e-10  # keeps atan2 differentiable where a pixel is dark
 
 
 def unproject(depth: Tensor, intrinsics: Tensor) -> Tensor:
-    """Points (B, 3, H, W) of depth (B, 1, H, W), metres."""
+    """Return points (B, 3, H, W) of depth (B, 1, H, W), metres."""
     return depth * rays(intrinsics, *depth.shape[-2:])
 
 
@@ -34,14 +33,14 @@ def unit(vectors: Tensor) -> Tensor:
 
 
 def shifted(image: Tensor, dy: int, dx: int) -> Tensor:
-    """``out[v, u] = image[v + dy, u + dx]``; beyond the border the border is repeated."""
+    """Return ``out[v, u] = image[v + dy, u + dx]``; beyond the border the border is repeated."""
     h, w = image.shape[-2:]
     padded = F.pad(image, (max(-dx, 0), max(dx, 0), max(-dy, 0), max(dy, 0)), mode="replicate")
     return padded[..., max(dy, 0) : max(dy, 0) + h, max(dx, 0) : max(dx, 0) + w]
 
 
 def doubled_parts(image: Tensor) -> Tensor:
-    """Bilinear x2 (B, C, 4, H, W), the four sub-pixels beside each other: what ``pixel_shuffle`` of (B, 4C, H, W) interleaves."""
+    """Double bilinearly, the four sub-pixels side by side (B, C, 4, H, W): ``pixel_shuffle`` of (B, 4C, H, W) interleaves them."""
     across = [torch.lerp(image, shifted(image, 0, dx), 0.25) for dx in (-1, 1)]
     return torch.stack([torch.lerp(a, shifted(a, dy, 0), 0.25) for dy in (-1, 1) for a in across], dim=2)
 
@@ -53,9 +52,9 @@ def offsets(radius: int, step: int = 1) -> Iterator[tuple[int, int]]:
 
 
 def _moment_filters(radius: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """(6, 3, 1, k) along rows and (10, 6, k, 1) along columns: powers of u of each image, then of v of each of those.
+    """Filters (6, 3, 1, k) along rows and (10, 6, k, 1) along columns: powers of u of each image, then of v of those.
 
-    They are made where they are used: a copy from the host would keep a GPU waiting, and cannot be part of a CUDA graph.
+    Made on the device: a copy from the host would keep a GPU waiting and cannot be part of a CUDA graph.
     """
     r = torch.arange(-radius, radius + 1, dtype=like.dtype, device=like.device)
     powers = torch.stack([torch.ones_like(r), r, r * r])
@@ -68,7 +67,7 @@ def _moment_filters(radius: int, like: Tensor) -> tuple[Tensor, Tensor]:
 
 @contextmanager
 def _whole_float32(device: torch.device) -> Iterator[None]:
-    """Convolve in float32 all through: moments need more than the 8 bits of mantissa of bfloat16, and than the 11 of TF32 on GPUs."""
+    """Convolve in float32 all through: moments need more mantissa than bfloat16 and TF32 have."""
     now = torch.backends.cudnn
     with (
         torch.autocast(device.type, enabled=False),
@@ -78,17 +77,14 @@ def _whole_float32(device: torch.device) -> Iterator[None]:
 
 
 def _moments(images: Tensor, radius: int) -> Tensor:
-    """Sums (B, 10, H, W) over every window of images (B, 3, H, W) a, b, c: ``a (1, v, vv, u, uv, uu), b (1, v, u), c``.
-
-    All at once: convolutions of one channel run at a fraction of a processor's speed.
-    """
+    """Sum images a, b, c over every window: (B, 10, H, W) ``a (1, v, vv, u, uv, uu), b (1, v, u), c``, all at once for speed."""
     rows, columns = _moment_filters(radius, images)
     with _whole_float32(images.device):
         return F.conv2d(F.conv2d(images, rows, padding=(0, radius)), columns, padding=(radius, 0))
 
 
 def local_planes(depth: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Tensor]:
-    """Fit inverse depth linearly in every window (method: ``n . r = 1 / z``, a plane is linear in inverse depth).
+    """Fit inverse depth linearly in every window: a plane is linear in inverse depth, ``n . r = 1 / z``.
 
     Parameters
     ----------
@@ -125,10 +121,7 @@ def local_planes(depth: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Ten
 
 
 def plane_normals(coefficients: Tensor, intrinsics: Tensor, directions: Tensor | None = None) -> Tensor:
-    """Turn :func:`local_planes` into unit camera-facing normals (B, 3, H, W).
-
-    ``directions`` are the :func:`tofcapture_model.geometry.intrinsics.rays` of the grid, where they are at hand: a lens takes some time to invert.
-    """
+    """Turn :func:`local_planes` into unit camera-facing normals (B, 3, H, W); ``directions`` are the grid's rays, if at hand."""
     centre, a, b = coefficients.unbind(1)
     x, y, _ = (rays(intrinsics, *centre.shape[-2:]) if directions is None else directions).unbind(1)
     ux, uy, vx, vy = pixel_slopes(intrinsics, x, y)
@@ -141,21 +134,7 @@ def plane_normals(coefficients: Tensor, intrinsics: Tensor, directions: Tensor |
 
 
 def depth_to_normals(depth: Tensor, valid: Tensor, intrinsics: Tensor, radius: int = 4) -> Tensor:
-    """Normals of a depth map by least squares on inverse depth.
-
-    Parameters
-    ----------
-    depth, valid
-        (B, 1, H, W) metres, and weight of every pixel.
-    intrinsics
-        (B, 4 or 9).
-    radius
-        4 is the 9 x 9 window of GeoNet.
-
-    Returns
-    -------
-    (B, 3, H, W) unit, camera-facing
-    """
+    """Fit unit camera-facing normals (B, 3, H, W) to a depth map by :func:`local_planes`; radius 4 is GeoNet's 9 x 9 window."""
     coefficients, _ = local_planes(depth, valid, radius)
     return plane_normals(coefficients, intrinsics)
 
@@ -163,10 +142,10 @@ def depth_to_normals(depth: Tensor, valid: Tensor, intrinsics: Tensor, radius: i
 def side_window_planes(
     depth: Tensor, valid: Tensor, radius: int, floor: float = 2e-3
 ) -> tuple[Tensor, Tensor]:
-    """Fit planes that do not reach across edges.
+    """Fit planes that do not reach across edges: side-window filtering with planes instead of means.
 
-    Each pixel is explained by nine windows: the one centred on it and the eight that touch it with a side or a corner;
-    those that fit badly (they hold an edge) count little. It is side-window filtering with planes instead of means.
+    Nine windows explain a pixel: the one centred on it and the eight that touch it with a side or a corner. Those that fit
+    badly, as they hold an edge, count little.
 
     Parameters
     ----------
@@ -212,8 +191,8 @@ def propagate_depth(
 ) -> Tensor:
     """Move every depth towards the tangent planes of its neighbours (GeoNet's normal-to-depth kernel regression).
 
-    The neighbour j votes ``z_ji = z_j (n_j . r_j) / (n_j . r_i)`` for pixel i with weight ``n_j . n_i`` where that is above
-    ``alpha``; the sign of the normals cancels. Votes further than ``max_jump`` from the present depth are dropped.
+    Neighbour j votes ``z_ji = z_j (n_j . r_j) / (n_j . r_i)`` for pixel i with weight ``n_j . n_i`` where that is above
+    ``alpha``. Votes further than ``max_jump`` from the present depth are dropped.
 
     Parameters
     ----------
@@ -251,12 +230,12 @@ def propagate_depth(
 
 
 def turn(new: Tensor, old: Tensor) -> Tensor:
-    """(B, 1, H, W) radians in [-pi, pi] from phasor ``old`` to phasor ``new``, each (B, 2, H, W) I and Q."""
+    """Return the angle (B, 1, H, W) in [-pi, pi] from phasor ``old`` to ``new``, each (B, 2, H, W) I and Q."""
     real = (new * old).sum(1, keepdim=True)
     imaginary = (new[:, 1] * old[:, 0] - new[:, 0] * old[:, 1])[:, None]
     return torch.atan2(imaginary, real + torch.where(real < 0, -_FAINT, _FAINT))
 
 
 def metres_per_radian(frame: Frame, which: int) -> Tensor:
-    """(B, 1, 1, 1) range per phase of the low (0) or the high (1) frequency."""
+    """Return (B, 1, 1, 1) range per phase of the low (0) or the high (1) frequency."""
     return (SPEED_OF_LIGHT / (4 * math.pi)) / frame.modulation[:, which].reshape(-1, 1, 1, 1)

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import dumps_config
-from tofcapture_model.data.frame import Estimate, Frame
+from tofcapture_model.frame import Estimate, Frame
 from tofcapture_model.inference.onnx_backend import CONFIG, DIGEST, OUTPUTS, ask_onnx, open_onnx
-from tofcapture_model.training.checkpoint import find_model, load_model
+from tofcapture_model.networks.checkpoint import find_model, load_model
 
 SUFFIX = {"onnx": ".onnx", "torch": ".pt2"}
 SIZE = (180, 240)  # px, sensor rows and columns
@@ -32,7 +32,7 @@ class Flat(nn.Module):
         self.model = model
 
     def forward(self, *fields: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """See :class:`tofcapture_model.data.frame.Frame` and :class:`tofcapture_model.data.frame.Estimate`."""
+        """See :class:`tofcapture_model.frame.Frame` and :class:`tofcapture_model.frame.Estimate`."""
         found: Estimate = self.model(Frame(*fields))
         return found.depth, found.normals, found.error
 

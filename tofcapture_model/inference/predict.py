@@ -19,13 +19,13 @@ from tofcapture.errors import ConfigError, DataError
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import frequencies
 from tofcapture_model.config import BASELINES
-from tofcapture_model.data.frame import MAX_RANGE, MIN_RANGE, Frame
-from tofcapture_model.data.frames import batched, frame_decoder, make_frame, with_cues
+from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
 from tofcapture_model.data.raw_input import RawInput, expect_finite, read_input, taken
+from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
 from tofcapture_model.geometry.decoder import Taps, TorchDecoder
 from tofcapture_model.inference.prediction import Prediction, write_prediction
+from tofcapture_model.networks.checkpoint import find_model, load_model
 from tofcapture_model.networks.joint import JointModel
-from tofcapture_model.training.checkpoint import find_model, load_model
 
 Float32 = NDArray[np.float32]
 T = TypeVar("T")

@@ -1,0 +1,93 @@
+"""Every network that a configuration can name, behind one interface: build it, choose what learns, hold it against the truth."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+
+import torch
+from torch import nn
+
+from tofcapture.errors import ConfigError
+from tofcapture_model.config import Config, Losses
+from tofcapture_model.frame import Estimate, Frame, Target
+from tofcapture_model.geometry.intrinsics import scale_intrinsics
+from tofcapture_model.losses import Objective, objective
+from tofcapture_model.networks.baselines import Baseline
+from tofcapture_model.networks.baselines.coarse_fine import CoarseFine
+from tofcapture_model.networks.baselines.guo2018 import MRM
+from tofcapture_model.networks.baselines.su2018 import ToFNet
+from tofcapture_model.networks.joint import CompactModel, JointModel, PaperModel
+from tofcapture_model.networks.unet import UNet
+
+Model = JointModel | Baseline
+
+PARTS = {
+    "depth": ("raw2depth", "error_map"),
+    "normal": ("raw2normal",),
+    "refine": ("refinement",),
+    "joint": ("backbone", "raw2depth", "error_map", "raw2normal", "refinement"),
+}
+
+
+def build_model(config: Config) -> Model:
+    """Build the model of a configuration, in channels-last memory order (a third faster on CPU)."""
+    network = config.network
+    build: dict[str, Callable[[], Model]] = {
+        "paper": lambda: PaperModel(network),
+        "compact": lambda: CompactModel(network),
+        "su2018": lambda: ToFNet(network.width),
+        "guo2018": MRM,
+        "coarse-fine": CoarseFine,
+    }
+    return build[network.kind]().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
+
+
+def compile_unets(model: Model, device: torch.device) -> None:
+    """Compile the U-Nets of a model in place (``training.compile``); names and values of its weights stay.
+
+    Plane fits and losses stay as they are: compiling a whole model was not done after 400 s.
+
+    Raises
+    ------
+    ConfigError
+        The model has no U-Net, or PyTorch would find no C++ compiler for a CPU.
+    """
+    compiler = os.environ.get("CXX", "g++")
+    if device.type == "cpu" and shutil.which(compiler) is None:
+        raise ConfigError(
+            f"training.compile: expected the C++ compiler {compiler}, found none",
+            hint="install g++, name one in CXX, or leave compile = false",
+        )
+    nets = [module for module in model.modules() if isinstance(module, UNet)]
+    if not nets:
+        raise ConfigError(
+            f"training.compile: expected a network of U-Nets (paper, compact), got {type(model).__name__}",
+            hint="leave compile = false",
+        )
+    for net in nets:
+        net.compile()
+
+
+def select_stage(model: Model, stage: str) -> list[nn.Parameter]:
+    """Freeze all parameters but those that learn in ``stage``; return these. All of a baseline learn in its only stage."""
+    for name, parameter in model.named_parameters():
+        learns = isinstance(model, Baseline) or name.split(".")[0] in PARTS[stage]
+        parameter.requires_grad_(
+            learns and parameter.numel() > 0
+        )  # a refinement of no rounds has empty gains
+    return [p for p in model.parameters() if p.requires_grad]
+
+
+def training_loss(
+    model: Model, weights: Losses, stage: str, estimate: Estimate, target: Target, frame: Frame
+) -> Objective:
+    """Compute what a step lowers: the paper's losses for our model, a baseline's own for a baseline.
+
+    ``estimate`` and ``target`` are at (2H, 2W); ``frame`` (B, ., H, W) is what the model read.
+    """
+    if isinstance(model, Baseline):
+        loss = model.loss(estimate, target, frame)
+        return Objective(loss, {"depth": loss}, torch.zeros(7))
+    return objective(weights, stage, estimate, target, scale_intrinsics(frame.intrinsics, 2))

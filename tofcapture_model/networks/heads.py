@@ -1,8 +1,8 @@
-"""The three networks of the paper, and their compact siblings: inputs and heads.
+"""The parts of the networks: what they read, the three heads, the refinement.
 
-Every head answers at twice the resolution. Depth starts as the decoded ToF depth, normals of ``compact`` as those of planes fitted to it; those of
-the paper's network start towards the camera, and its refinement makes them those of the depth. So an untrained model that sees the decoded depth is the
-sensor, and training can only be judged by what it adds.
+Every head answers at twice the resolution. Depth starts as the decoded ToF depth, the paper's normals towards the camera,
+compact's as those of planes fitted to the depth. So an untrained model that sees the decoded depth is the sensor, and
+training can only be judged by what it adds.
 """
 
 from __future__ import annotations
@@ -14,18 +14,19 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.config import SOURCES, Network
-from tofcapture_model.data.frame import Frame, expect_channels
+from tofcapture_model.frame import Frame, expect_channels
 from tofcapture_model.geometry.intrinsics import rays
 from tofcapture_model.geometry.maps import (
+    depth_to_normals,
     doubled_parts,
     local_planes,
     plane_normals,
+    propagate_depth,
     side_window_planes,
     unit,
 )
 from tofcapture_model.networks.unet import (
     CONVEX_CHANNELS,
-    UNet,
     bilinear_logits,
     convex_upsample,
     double_conv,
@@ -42,6 +43,8 @@ FIT_RADII = (1, 2)  # px of the sensor, of the planes that compact fits to its o
 _HEAD_WIDTH = 24
 _HOLE = 1e-3  # weight of a filled pixel
 _PHASOR_FLOOR = 1e-4  # of saturation; below it an amplitude is noise
+_MIN_ERROR = 1e-3  # m; the same floor as in eq. 1
+_GAIN_UNIT = 5.0  # gains learn at the pace of the weights of a layer, which move by much less than 1
 
 
 class Features(NamedTuple):
@@ -54,7 +57,7 @@ class Features(NamedTuple):
     candidates
         (B, K, H, W) classically denoised or corrected depths, metres; K may be 0.
     normals
-        (B, 3, H, W) normals to start from; unit.
+        (B, 3, H, W) unit normals to start from.
     rays
         (B, 3, H, W) of the sensor's pixels, z = 1; a lens takes some time to invert.
     """
@@ -66,7 +69,7 @@ class Features(NamedTuple):
 
 
 class PaperInputs(nn.Module):
-    """Stack the paper's inputs: 8 raw channels, confidence, decoded depth; in that order, 10 channels in all."""
+    """Stack the paper's inputs in their order: 8 raw channels, confidence, decoded depth; 10 channels in all."""
 
     def __init__(self, sources: tuple[str, ...]) -> None:
         super().__init__()
@@ -83,7 +86,7 @@ class PaperInputs(nn.Module):
 
 
 class CompactInputs(nn.Module):
-    """Turn a frame into what physics says matters: phasors, amplitudes, the frequencies' gap, plane fits at some scales."""
+    """Compute what physics says matters: phasors, amplitudes, the frequencies' gap, cues, plane fits at some scales."""
 
     def __init__(self, windows: tuple[int, ...]) -> None:
         super().__init__()
@@ -111,9 +114,8 @@ class CompactInputs(nn.Module):
             *((n[:, :2]) for n in normals),
         ]
         corrected = frame.depth - frame.cues * self.cue_scale
-        return Features(
-            torch.cat(channels, 1), torch.cat([*smooth, corrected], 1), normals[len(normals) // 2], r
-        )
+        candidates = torch.cat([*smooth, corrected], 1)
+        return Features(torch.cat(channels, 1), candidates, normals[len(normals) // 2], r)
 
 
 def _phasor_channels(phasor: Tensor) -> list[Tensor]:
@@ -127,39 +129,40 @@ def _phasor_channels(phasor: Tensor) -> list[Tensor]:
     return [*out, *logs, (logs[1] - logs[0]) * 3]
 
 
-def _zeroed(inputs: int, outputs: int) -> nn.Conv2d:
+def zeroed_conv(inputs: int, outputs: int) -> nn.Conv2d:
+    """Make a 1 x 1 convolution that starts at zero."""
     conv = nn.Conv2d(inputs, outputs, 1)
     nn.init.zeros_(conv.weight)
     nn.init.zeros_(conv.bias) if conv.bias is not None else None
     return conv
 
 
-def _head(network: Network, channels: int, outputs: int) -> nn.Module:
-    """Build a U-Net of its own for the paper, a 1 x 1 convolution on the shared backbone for compact."""
-    if network.kind == "paper":
-        return UNet(channels, outputs, network.width, network.levels, zero_last=True)
-    return _zeroed(channels, outputs)
-
-
-def sees_decoded(network: Network) -> bool:
-    """Whether a network may use the decoded depth: only then is its answer a correction of it (paper, table IV: Conf., Raw)."""
-    return network.kind != "paper" or "depth" in network.inputs
-
-
 def _planes(image: Tensor) -> Tensor:
-    """Single precision, a plane for each channel: what takes channels apart is slow where they lie side by side, as convolutions leave them."""
+    """Single precision, a plane for each channel: taking channels apart is slow where they lie side by side."""
     return image.to(torch.float32, memory_format=torch.contiguous_format)
 
 
 class Raw2Depth(nn.Module):
-    """Decoded depth + gated steps to its candidates + residual, then convex upsampling; without it, depth about ``MIDDLE``."""
+    """Decoded depth + gated steps to its candidates + residual, then convex upsampling.
 
-    def __init__(self, network: Network, channels: int) -> None:
+    Parameters
+    ----------
+    net
+        Maps the shared image to ``candidates + 1 + CONVEX_CHANNELS`` channels.
+    network
+        ``max_residual`` and ``learned_upsampling`` of it count.
+    candidates
+        Depths that are stepped to.
+    decoded
+        Whether the answer is a correction of the decoded depth; without it, depth about ``MIDDLE``.
+    """
+
+    def __init__(
+        self, net: nn.Module, network: Network, *, candidates: int = 0, decoded: bool = True
+    ) -> None:
         super().__init__()
-        self.candidates = len(network.windows) + len(CUE_SCALE) if network.kind == "compact" else 0
+        self.net, self.candidates, self.decoded = net, candidates, decoded
         self.max_residual, self.learned = network.max_residual, network.learned_upsampling
-        self.decoded = sees_decoded(network)
-        self.net = _head(network, channels, self.candidates + 1 + CONVEX_CHANNELS)
         self.register_buffer("bilinear", bilinear_logits().reshape(1, -1, 1, 1), persistent=False)
         self.bilinear: Tensor
 
@@ -180,12 +183,14 @@ class Raw2Depth(nn.Module):
 
 
 class ErrorMap(nn.Module):
-    """Expected absolute error of the depth. Reads the depth detached: the error must not shape the depth."""
+    """Expected error of the depth, by ``net`` of the shared image and 4 channels of the depth.
 
-    def __init__(self, network: Network, channels: int) -> None:
+    The depth is read detached: the error must not shape it.
+    """
+
+    def __init__(self, net: nn.Module, *, decoded: bool = True) -> None:
         super().__init__()
-        self.net = _head(network, channels + 4, 4)
-        self.decoded = sees_decoded(network)
+        self.net, self.decoded = net, decoded
         self.register_buffer("calibration", torch.ones(()))  # set after training, see evaluate.calibrate
         self.calibration: Tensor
 
@@ -197,51 +202,79 @@ class ErrorMap(nn.Module):
         return F.softplus(F.pixel_shuffle(out, 2)) * (RESIDUAL_UNIT * self.calibration)
 
 
-class Raw2Normal(nn.Module):
-    """Residual on the starting normals, by sub-pixel convolution.
+class PaperNormals(nn.Module):
+    """Residual on the starting normals, by sub-pixel convolution of the 12 channels of ``net``."""
 
-    ``compact`` also fits planes to its own depth, in windows of 3 and of 5 pixels, and steps towards their normals by learned
-    gates: depth is denoised first, and normals follow from it where noise let them (depth to normal, as in the paper's IV-C).
+    def __init__(self, net: nn.Module) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, shared: Tensor, features: Features, depth: Tensor, frame: Frame) -> Tensor:
+        """Return unit camera-facing normals (B, 3, 2H, 2W)."""
+        del depth, frame
+        return unit(doubled(features.normals) + F.pixel_shuffle(self.net(shared).float(), 2))
+
+
+class CompactNormals(nn.Module):
+    """Residual on the starting normals, and gated steps to those of planes fitted to the network's own depth.
+
+    Planes are fitted in windows of 3 and of 5 pixels. Depth is denoised first, and normals follow from it where noise lets
+    them: depth to normal, as in the paper's IV-C.
     """
 
-    def __init__(self, network: Network, channels: int) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        self.fits = FIT_RADII if network.kind == "compact" else ()
-        self.net = (
-            _two_layers(channels + 3 * (len(self.fits) + 1), 12 + 4 * len(self.fits))
-            if self.fits
-            else _head(network, channels, 12)
-        )
+        inputs, outputs = channels + 3 * (len(FIT_RADII) + 1), 12 + 4 * len(FIT_RADII)
+        self.net = nn.Sequential(*double_conv(inputs, _HEAD_WIDTH), zeroed_conv(_HEAD_WIDTH, outputs))
+        self.net[:-1].apply(he_initialised)
 
     def forward(self, shared: Tensor, features: Features, depth: Tensor, frame: Frame) -> Tensor:
         """Return unit camera-facing normals (B, 3, 2H, 2W) of a depth (B, 1, 2H, 2W)."""
-        if not self.fits:
-            return unit(doubled(features.normals) + F.pixel_shuffle(self.net(shared).float(), 2))
-        fitted = self._fitted(depth, frame, features.rays)
+        coarse, weight = F.avg_pool2d(depth, 2), frame.valid + _HOLE
+        fitted = [
+            plane_normals(local_planes(coarse, weight, radius)[0], frame.intrinsics, features.rays)
+            for radius in FIT_RADII
+        ]
         out = _planes(self.net(torch.cat([shared, features.normals, *fitted], dim=1)))
-        # sub-pixels side by side until the end: interpolating and interleaving each term costs more than the convolutions
+        # sub-pixels side by side until the end: interleaving each term costs more than the convolutions
         parts = torch.unflatten(out, 1, (-1, 4))
         normals = doubled_parts(features.normals) + parts[:, :3]
         for k, n in enumerate(fitted, 3):
             normals = torch.addcmul(normals, parts[:, k : k + 1], doubled_parts(n - features.normals))
         return F.pixel_shuffle(unit(normals).flatten(1, 2), 2)
 
-    def _fitted(self, depth: Tensor, frame: Frame, directions: Tensor) -> list[Tensor]:
-        coarse = F.avg_pool2d(depth, 2)
-        weight = frame.valid + _HOLE
-        return [
-            plane_normals(local_planes(coarse, weight, radius)[0], frame.intrinsics, directions)
-            for radius in self.fits
-        ]
-
 
 def doubled(image: Tensor) -> Tensor:
-    """Bilinear x2."""
+    """Double the resolution bilinearly."""
     return F.interpolate(image, scale_factor=2, mode="bilinear", align_corners=False)
 
 
-def _two_layers(inputs: int, outputs: int) -> nn.Module:
-    """Build two 3 x 3 convolutions and a last one that starts at zero."""
-    net = nn.Sequential(*double_conv(inputs, _HEAD_WIDTH), _zeroed(_HEAD_WIDTH, outputs))
-    net[:-1].apply(he_initialised)
-    return net
+class Refinement(nn.Module):
+    """Depth to normals to depth, a few rounds with learned gains (paper section IV-C, after GeoNet).
+
+    The geometry has no parameters. Gains start at one: what it says is taken whole, until training knows better. A bad normal
+    map can make depth worse, so only neighbours whose normals agree and whose votes lie near are asked, and trusted by the
+    inverse square of their expected error.
+    """
+
+    def __init__(self, iterations: int, radius: int) -> None:
+        super().__init__()
+        self.radius = radius
+        self.depth_gain = nn.Parameter(torch.full((iterations,), 1 / _GAIN_UNIT))
+        self.normal_gain = nn.Parameter(torch.full((iterations,), 1 / _GAIN_UNIT))
+
+    def forward(
+        self, depth: Tensor, normals: Tensor, error: Tensor, intrinsics: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Refine depth (B, 1, H, W) and normals (B, 3, H, W) by the expected error (B, 1, H, W), metres."""
+        confidence = error.detach().clamp_min(_MIN_ERROR) ** -2
+        confidence = confidence / confidence.amax(dim=(2, 3), keepdim=True)
+        # by number: a loop over an empty parameter is an operation that torch.export cannot read back
+        for k in range(len(self.depth_gain)):
+            depth_gain, normal_gain = self.depth_gain[k], self.normal_gain[k]
+            # a measurement of the present depth, not a path for gradients: those reach the depth by propagation
+            fitted = depth_to_normals(depth.detach(), confidence, intrinsics, radius=4)
+            normals = unit(normals + _GAIN_UNIT * normal_gain * (fitted - normals))
+            moved = propagate_depth(depth, normals, intrinsics, confidence, self.radius, step=2)
+            depth = depth + _GAIN_UNIT * depth_gain * (moved - depth)
+        return depth, normals

@@ -1,7 +1,4 @@
-"""U-Net (Ronneberger 2015) with same-padding, and the x2 heads.
-
-No batch norm: the paper names the plain network, and depth is an absolute quantity that batch statistics would shift.
-"""
+"""U-Net (Ronneberger 2015) with same-padding and no batch norm, which would shift absolute depths; convex x2 upsampling."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from tofcapture_model.geometry.maps import shifted
 
 
 def double_conv(inputs: int, outputs: int) -> nn.Sequential:
-    """Two 3 x 3 convolutions with ReLU."""
+    """Make two 3 x 3 convolutions with ReLU."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, padding=1),
         nn.ReLU(inplace=True),
@@ -35,10 +32,9 @@ def pad_to_multiple(image: Tensor, multiple: int) -> tuple[Tensor, tuple[int, in
 
 
 class UNet(nn.Module):
-    """U-Net of any base width and depth.
+    """U-Net of any base width and depth, He initialised.
 
-    ``UNet(10, 1, 64)`` has the original's widths 64 ... 1024 and 31,035,777 parameters. He initialisation; the last 1 x 1
-    convolution starts at zero when ``zero_last`` is set, so that a residual network begins as the identity.
+    ``UNet(10, 1, 64)`` has the original's widths 64 ... 1024 and 31,035,777 parameters.
 
     Parameters
     ----------
@@ -47,7 +43,9 @@ class UNet(nn.Module):
     width
         Channels of the first level; every level doubles it.
     levels
-        Resolutions; 5 in the original (images are padded to multiples of 16 by reflection and cropped after).
+        Resolutions; 5 in the original.
+    zero_last
+        Start the last 1 x 1 convolution at zero: a residual network then begins as the identity.
     """
 
     def __init__(
@@ -93,30 +91,16 @@ CONVEX_CHANNELS = 36  # nine neighbours for each of four sub-pixels
 
 
 def bilinear_logits() -> Tensor:
-    """(36,) logits whose softmax over the nine neighbours is bilinear x2 interpolation (weights 9, 3, 3, 1 of 16).
-
-    Weights that bilinear has at zero are e^-14: small, but able to learn.
-    """
+    """Return (36,) logits whose softmax over the nine neighbours is bilinear x2 interpolation; its zeros are e^-14, which learns."""
     line = torch.tensor([[1.0, 3.0, 0.0], [0.0, 3.0, 1.0]]) / 4  # sub-pixel 0 leans to the previous pixel
     weights = torch.einsum("ay,bx->yxab", line, line).reshape(9, 4)
     return weights.clamp_min(math.exp(-14)).log().flatten()
 
 
 def convex_upsample(image: Tensor, logits: Tensor) -> Tensor:
-    """Double the resolution; every value is a convex combination of its 3 x 3 neighbours (RAFT's upsampling).
+    """Double the resolution of (B, C, H, W) by convex combinations of 3 x 3 neighbours (RAFT's upsampling); nothing overshoots.
 
-    Nothing overshoots at an edge, and no value arises that lies outside of its neighbourhood.
-
-    Parameters
-    ----------
-    image
-        (B, C, H, W).
-    logits
-        (B, 36, H, W): 9 neighbours x 4 sub-pixels.
-
-    Returns
-    -------
-    (B, C, 2H, 2W)
+    ``logits`` are (B, 36, H, W): 9 neighbours x 4 sub-pixels.
     """
     b, c, h, w = image.shape
     weights = logits.float().reshape(b, 9, 4, h, w).softmax(dim=1)

@@ -18,9 +18,9 @@ from tofcapture.files.manifest import Manifest
 from tofcapture.files.shard import GroundTruth, ShardReader
 from tofcapture.poses import Float64
 from tofcapture.viz.figures.scenes import Maps
-from tofcapture_model.data.frames import batched, make_frame
-from tofcapture_model.networks.baselines import sensor
-from tofcapture_model.networks.zoo import Model
+from tofcapture_model.data import batched, make_frame
+from tofcapture_model.networks import Model
+from tofcapture_model.networks.baselines import sensor_estimate
 
 Float32 = NDArray[np.float32]
 FRAME = 0  # of the burst; evaluate takes the same one
@@ -116,7 +116,7 @@ def _example(shard: ShardReader, view: int, model: Model | None) -> Example:
     info = shard.info
     frame = batched(make_frame(shard.raw(view, FRAME), info, shard.camera, shard.celsius(view, FRAME)))
     truth = shard.ground_truth(view, 2)
-    depth, normals, _ = sensor.estimate(frame)
+    depth, normals, _ = sensor_estimate(frame)
     answers, expected = {"sensor": _maps(depth, normals, truth)}, None
     if model is not None:
         estimate = model(frame)

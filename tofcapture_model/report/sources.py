@@ -12,10 +12,9 @@ from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.manifest import Manifest, load_manifest, manifest_path
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Config
-from tofcapture_model.networks.zoo import Model
-from tofcapture_model.training.checkpoint import find_model, load_model
-from tofcapture_model.training.learned import origin, sentence
-from tofcapture_model.training.runlog import read_metrics
+from tofcapture_model.networks import Model
+from tofcapture_model.networks.checkpoint import find_model, load_model, origin, sentence
+from tofcapture_model.training import read_metrics
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class Network:
     Attributes
     ----------
     model, config, provenance
-        From :func:`tofcapture_model.training.checkpoint.load_model`.
+        From :func:`tofcapture_model.networks.checkpoint.load_model`.
     name, sha256
         Of the file.
     rows

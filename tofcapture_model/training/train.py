@@ -1,113 +1,40 @@
-"""Train a model: one loop, no callbacks. ``torchrun`` makes it run on many processes; a killed run goes on bit by bit."""
+"""Train a model: forward, loss, backward, step. ``torchrun`` makes it run on many processes."""
 
 from __future__ import annotations
 
-import hashlib
 import math
-import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, closing
-from dataclasses import dataclass, replace
+import zlib
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch.utils.data import DataLoader
+from torch import nn
 
-from tofcapture.errors import ConfigError, DataError
+from tofcapture.cli.kit import Report
 from tofcapture.files.manifest import load_manifest
-from tofcapture.files.seal import sha256_of
-from tofcapture_model.config import Config, Stage, Training, dumps_config
-from tofcapture_model.data.frames import FrameDataset, collate, epoch_batches, spare_memory
-from tofcapture_model.evaluation.evaluate import calibrate, model_method, score
+from tofcapture_model.config import Config, Stage, Training
+from tofcapture_model.data import FrameDataset, spare_memory
+from tofcapture_model.data.augment import BurstNoise, redraw_calibration, redraw_frame
+from tofcapture_model.evaluation.evaluate import calibrate
+from tofcapture_model.frame import Estimate, Frame, frame_to, target_to
+from tofcapture_model.losses import Objective
+from tofcapture_model.networks import Model, build_model, compile_unets, select_stage, training_loss
+from tofcapture_model.networks.checkpoint import save_model
 from tofcapture_model.networks.joint import JointModel
-from tofcapture_model.networks.zoo import Model, build_model, compile_unets
-from tofcapture_model.training.checkpoint import (
-    find_model,
-    load_model,
-    load_resume,
-    load_strictly,
-    save_model,
-    save_resume,
-)
-from tofcapture_model.training.learned import learned_from
-from tofcapture_model.training.learner import Group, Learner, processes, scheduled_rate
-from tofcapture_model.training.run_card import write_card
-from tofcapture_model.training.runlog import Log, Position
+from tofcapture_model.training import Group, Moments, Position, Run, Trained, eagerly, processes, source_of
+from tofcapture_model.training.card import write_card
 
-SAVE_EVERY = 60.0  # s between resume points
-LOG_EVERY = 20  # steps
-LEAST_SHARE = 0.1  # of a budget in minutes, for each stage
-Report = Callable[[str, float, str], None]
-
-
-@dataclass(frozen=True)
-class Trained:
-    """Result of :func:`train`: the checkpoint, steps done, whether all stages are finished, the last losses."""
-
-    path: Path
-    steps: int
-    finished: bool
-    losses: dict[str, float]
-
-
-@dataclass
-class _Run:
-    """A run on its way: what it trains, where, how far it is.
-
-    Attributes
-    ----------
-    config, model, group
-        What is trained, and by which processes.
-    out, key
-        Its folder, and the digest of all that decides what it computes.
-    minutes
-        Budget of all stages together; ``None``: their epochs count.
-    position, moments
-        How far it is; the optimiser's state there, until a stage has taken it over.
-    losses
-        The last that were logged.
-    """
-
-    config: Config
-    model: Model
-    group: Group
-    out: Path
-    key: str
-    minutes: float | None
-    position: Position
-    moments: dict[str, dict[str, Tensor]]
-    losses: dict[str, float]
-
-    def budget(self, stage: Stage) -> float | None:
-        """Seconds of a stage; stages share the budget by their epochs, but none gets much less than a tenth.
-
-        Five of the paper's 695 epochs are thousands of steps; as a share of some minutes they would be a handful.
-        """
-        if self.minutes is None:
-            return None
-        shares = {
-            s: max(s.epochs / sum(t.epochs for t in self.config.stages), LEAST_SHARE)
-            for s in self.config.stages
-        }
-        return 60 * self.minutes * shares[stage] / sum(shares[s] for s in self.config.stages)
-
-    def save(self, learner: Learner) -> None:
-        """Write the resume point."""
-        state = {"key": self.key, "losses": self.losses, **self.position.__dict__}
-        save_resume(self.out / "resume.safetensors", self.model, learner.optimizer, learner.names, state)
-
-    def ended(self, *, finished: bool) -> Trained:
-        """Say what has become of the run."""
-        name = "model.safetensors" if finished else "resume.safetensors"
-        return Trained(self.out / name, self.position.step, finished=finished, losses=self.losses)
+WARM_UP = 0.02  # of a stage, with a cosine schedule
+MAX_NORM = 1.0  # of the gradient
 
 
 def train(
     config: Config,
-    dataset: Path,
-    out: Path,
+    dataset: str | Path,
+    out: str | Path,
     *,
     epochs: int | None = None,
     minutes: float | None = None,
@@ -117,7 +44,7 @@ def train(
     cache: Path | None = None,
     start: Path | None = None,
     also: Sequence[Path] = (),
-    report: Callable[[str, float, str], None] = lambda _what, _done, _text: None,
+    report: Report = lambda _what, _done, _total, _text="": None,
 ) -> Trained:
     """Train all stages of a configuration on the ``train`` split of a dataset.
 
@@ -148,36 +75,124 @@ def train(
     also
         Further datasets whose ``train`` splits are learned from; validation stays with the first.
     report
-        Called with (stage, fraction done, one line of text).
+        Called with the stage, what is done of it, all of it, and one line of text.
 
-    Returns
-    -------
-    Trained
+    Raises
+    ------
+    ConfigError
+        The folder holds another run, or ``start`` another network.
+    DataError
+        A split is empty, or a loss is not finite: no step is taken then.
     """
     if epochs is not None:
         config = replace(config, stages=tuple(replace(s, epochs=epochs) for s in config.stages))
-    datasets = [dataset, *also]
+    datasets = [Path(dataset), *map(Path, also)]
     for each in datasets:
         load_manifest(each)  # says what is wrong with it, before anything is started
     with processes(device) as group:
         torch.manual_seed(config.training.seed)
-        model = build_model(config).to(group.place)
-        source = _source(datasets, _begin_with(model, config, start) if start else None)
-        run = _open_run(config, model, group, out, source, minutes)
+        model = build_model(config).to(group.device)
+        source = source_of(model, config, datasets, start)
+        run = Run(config, model, group, datasets[0], Path(out), source, minutes, report)
         if run.position.stage == len(config.stages):
-            return run.ended(finished=True)
+            return run.ended()
         if config.training.compile:
-            compile_unets(model, group.place)
+            compile_unets(model, group.device)
         data = _training_data(config.training, datasets, cache, workers)
-        with closing(data), closing(Log(out if group.rank == 0 else None)) as log:
+        with closing(data), run:
             for stage in config.stages[run.position.stage :]:
                 learner = Learner(model, config, stage, group, run.moments)
-                if not _train_stage(run, learner, data, log, dataset, stop_after, workers, report):
-                    return run.ended(finished=False)
+                for frame, target in run.batches(data, stage, workers):
+                    frame = frame_to(frame, group.device)  # noqa: PLW2901  on its way
+                    target = target_to(target, group.device)  # noqa: PLW2901
+                    frame = learner.augmented(frame, data.burst, run.position)  # noqa: PLW2901
+                    estimate = learner.forward(frame)
+                    loss = training_loss(model, config.losses, stage.name, estimate, target, frame)
+                    run.expect_finite("loss", float(loss.total.detach()))
+                    run.expect_finite("gradient", learner.backward(loss))
+                    rate = scheduled_rate(stage, config.training.schedule, run.progress)
+                    learner.step(rate)
+                    run.stepped(stage, loss, rate)
+                    stop = stop_after is not None and run.position.step >= stop_after
+                    run.save_now_and_then(learner.moments(), now=stop)
+                    if stop:
+                        return run.ended()
         if group.rank == 0:
-            _finish(run, dataset, source)
-            run.save(learner)
-        return run.ended(finished=True)
+            _finish(run, source)
+            run.save_now_and_then(learner.moments(), now=True)
+        return run.ended()
+
+
+class Learner:
+    """The part of a model that learns in a stage, with its optimiser.
+
+    Parameters
+    ----------
+    model, config, stage
+        What is trained, and how.
+    group
+        The processes that train together.
+    moments
+        Adam's, of a run that goes on; empty at the start of a stage.
+    """
+
+    def __init__(
+        self, model: Model, config: Config, stage: Stage, group: Group, moments: Moments | None = None
+    ) -> None:
+        self.training, self.stage, self.group = config.training, stage, group
+        self.parameters = select_stage(model, stage.name)
+        self.optimizer = torch.optim.Adam(self.parameters, lr=stage.learning_rate)
+        self._names = {id(p): n for n, p in model.named_parameters()}
+        self._network = nn.parallel.DistributedDataParallel(model) if group.world > 1 else model
+        for parameter in self.parameters:
+            if saved := (moments or {}).get(self._names[id(parameter)]):
+                self.optimizer.state[parameter] = {
+                    k: v if k == "step" else torch.empty_like(parameter).copy_(v) for k, v in saved.items()
+                }
+
+    def augmented(self, frame: Frame, burst: BurstNoise | None, position: Position) -> Frame:
+        """Draw the noise of means of bursts anew, and another calibration where the configuration asks for it.
+
+        The position seeds what is drawn: a resumed run draws what an unbroken one would have.
+        """
+        seed = f"{self.training.seed}/{position.stage}/{position.step}/{self.group.rank}"
+        drawn = torch.Generator(self.group.device).manual_seed(zlib.crc32(seed.encode()))
+        if burst:
+            frame = redraw_frame(frame, drawn, burst)
+        if self.training.phase_error:
+            frame = redraw_calibration(frame, drawn, self.training.phase_error)
+        return frame
+
+    def forward(self, frame: Frame) -> Estimate:
+        """Answer a batch, in float32 whatever the precision of the convolutions."""
+        reduced = self.training.precision == "bfloat16"
+        with torch.autocast(self.group.device.type, torch.bfloat16, enabled=reduced):
+            estimate = self._network(frame, self.stage.name)
+        return Estimate(*(x.float() for x in estimate))
+
+    def backward(self, loss: Objective) -> float:
+        """Compute the gradient of a loss and clip it; returns the norm that it had."""
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.total.backward()  # type: ignore[no-untyped-call]
+        return float(nn.utils.clip_grad_norm_(self.parameters, MAX_NORM))
+
+    def step(self, rate: float) -> None:
+        """Follow the gradient."""
+        for parameters in self.optimizer.param_groups:
+            parameters["lr"] = rate
+        self.optimizer.step()
+
+    def moments(self) -> Moments:
+        """Return Adam's moments by the parameter's name."""
+        return {self._names[id(p)]: values for p, values in self.optimizer.state.items()}
+
+
+def scheduled_rate(stage: Stage, schedule: str, progress: float) -> float:
+    """Return the learning rate at a fraction of a stage: constant, or a cosine to zero after a short warm-up."""
+    if schedule != "cosine":
+        return stage.learning_rate
+    cosine = max(0.5 * (1 + math.cos(math.pi * progress)), 1e-3)
+    return stage.learning_rate * min(1.0, 0.1 + progress / WARM_UP) * cosine
 
 
 def _training_data(
@@ -196,175 +211,12 @@ def _training_data(
     )
 
 
-def _train_stage(
-    run: _Run,
-    learner: Learner,
-    data: FrameDataset,
-    log: Log,
-    dataset: Path,
-    stop_after: int | None,
-    workers: int,
-    report: Report,
-) -> bool:
-    """Train the stage that the run is in, from where it is to its end; false if ``stop_after`` came first."""
-    position, group, stage, training = run.position, run.group, learner.stage, run.config.training
-    budget = run.budget(stage)
-    started, saved = time.monotonic() - position.elapsed, time.monotonic()
-    while not _done(position, stage, budget):
-        batches = epoch_batches(
-            len(data), training.batch, training.seed, position.epoch, group.rank, group.world
-        )
-        left = batches[position.batch :]
-        for frame, target in DataLoader(data, batch_sampler=left, num_workers=workers, collate_fn=collate):
-            progress = _progress(position, stage, len(batches), budget)
-            rate = scheduled_rate(stage, training.schedule, progress)
-            loss = learner.loss(frame, target, data.burst, position)
-            _expect_finite("loss", float(loss.total.detach()), position, run.out)
-            _expect_finite("gradient", learner.gradient(loss), position, run.out)
-            learner.step(rate)
-
-            position.step, position.batch = position.step + 1, position.batch + 1
-            position.elapsed = group.slowest(time.monotonic() - started)
-            if position.step % LOG_EVERY == 1:
-                run.losses = log.step(position, stage, loss, rate)
-                report(stage.name, progress, f"step {position.step} loss {run.losses['total']:.3f}")
-            stop = stop_after is not None and position.step >= stop_after
-            if group.rank == 0 and (stop or time.monotonic() - saved > SAVE_EVERY):
-                run.save(learner)
-                saved = time.monotonic()
-            if stop:
-                return False
-            if budget is not None and position.elapsed >= budget:
-                break
-        position.epoch, position.batch = position.epoch + 1, 0
-        every = training.validate_every
-        if group.rank == 0 and every and (_done(position, stage, budget) or position.epoch % every == 0):
-            log.validation(position, stage, _validate(run.model, dataset, group.place))
-    position.next_stage()
-    run.moments = {}
-    return True
-
-
-def _finish(run: _Run, dataset: Path, source: Mapping[str, Any]) -> None:
+def _finish(run: Run, source: Mapping[str, Any]) -> None:
     """Calibrate the uncertainty, write the run's card and the model."""
-    place = run.group.place
-    provenance: dict[str, Any] = {
-        **source,
-        "steps": run.position.step,
-        "minutes": round(run.position.before / 60, 2),
-        "losses": run.losses,
-    }
+    minutes = round(run.position.before / 60, 2)
+    known: dict[str, Any] = {**source, "steps": run.position.step, "minutes": minutes, "losses": run.losses}
     if isinstance(run.model, JointModel) and run.config.losses.uncertainty == "laplace":
-        with _eagerly():
-            provenance["uncertainty"] = calibrate(run.model, dataset, place)
-    provenance |= write_card(run.out, run.config, run.model, dataset, place, provenance, run.minutes)
-    save_model(run.out / "model.safetensors", run.model, run.config, provenance)
-
-
-def _expect_finite(what: str, value: float, position: Position, out: Path) -> None:
-    """Stop before a step that would spoil the weights."""
-    if not math.isfinite(value):
-        raise DataError(
-            f"{out}: expected a finite {what}, got {value} at step {position.step + 1}",
-            hint="check the dataset (tofcapture check); if it is sound, take a lower learning_rate and another --out",
-        )
-
-
-def _begin_with(model: Model, config: Config, start: Path) -> dict[str, Any]:
-    """Give the model the weights of a checkpoint; returns where they are from, and what they have learned from."""
-    other, its, provenance = load_model(start)
-    if its.network != config.network:
-        raise ConfigError(
-            f"{start}: expected weights of the configuration's network ({config.network.kind}), got {its.network.kind} with other sizes or kind",
-            hint=f"--config {find_model(start).with_suffix('.toml')} has its configuration",
-        )
-    load_strictly(model, other.state_dict(), start)
-    begun = {"start": str(start), "start_sha256": sha256_of(find_model(start))}
-    return begun | ({"learned": provenance["learned"]} if "learned" in provenance else {})
-
-
-def _source(datasets: Sequence[Path], begun: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Name the datasets by their folders and the digests of their manifests, and all that is learned from, as far as it is known."""
-    first, *also = datasets
-    source: dict[str, Any] = {"dataset": str(first), "manifest_sha256": _digest(first), **(begun or {})}
-    if also:
-        source["also"] = {str(d): _digest(d) for d in also}
-    if begun is None or "learned" in begun:
-        source["learned"] = learned_from(datasets, source.get("learned"))
-    return source
-
-
-def _digest(dataset: Path) -> str:
-    return sha256_of(Path(dataset) / "manifest.json")
-
-
-def _key(config: Config, source: Mapping[str, Any], minutes: float | None, world: int) -> str:
-    """Digest of all that decides what a run computes; a resume point of another run is refused."""
-    begun = source.get("start_sha256", "") + "".join(source.get("also", {}).values())
-    several = f"|{world} processes" if world > 1 else ""
-    text = f"{dumps_config(config)}|{source['manifest_sha256']}|{minutes}{begun}{several}"
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _open_run(
-    config: Config, model: Model, group: Group, out: Path, source: Mapping[str, Any], minutes: float | None
-) -> _Run:
-    """Begin a run, or go on with the one in its folder: loads its weights into the model.
-
-    The first process reads it and tells the others, who may be on machines that do not see the folder.
-    """
-    out = Path(out)
-    key = _key(config, source, minutes, group.world)
-    weights, moments, state = group.shared(_resume_point(out, key) if group.rank == 0 else ({}, {}, {}))
-    if not state:
-        return _Run(config, model, group, out, key, minutes, Position(), {}, {})
-    load_strictly(model, weights, out / "resume.safetensors")
-    losses = state.pop("losses", {})
-    return _Run(config, model, group, out, key, minutes, Position(**state), moments, losses)
-
-
-def _resume_point(
-    out: Path, key: str
-) -> tuple[dict[str, Tensor], dict[str, dict[str, Tensor]], dict[str, Any]]:
-    """Weights, Adam's moments and state of a run that is to go on; nothing where none was begun."""
-    path = out / "resume.safetensors"
-    if not path.exists():
-        return {}, {}, {}
-    weights, moments, state = load_resume(path)
-    if state.pop("key", None) != key:
-        raise ConfigError(
-            f"{out}: holds a run with another configuration, dataset, budget or number of processes",
-            hint="choose another --out, or delete it",
-        )
-    return weights, moments, state
-
-
-def _done(position: Position, stage: Stage, budget: float | None) -> bool:
-    return position.epoch >= stage.epochs if budget is None else position.elapsed >= budget
-
-
-def _progress(position: Position, stage: Stage, batches: int, budget: float | None) -> float:
-    """Fraction of the stage that is done, by steps, or by the clock where there is a budget."""
-    if budget is not None:
-        return min(position.elapsed / budget, 1.0)
-    return (position.epoch + position.batch / batches) / stage.epochs
-
-
-def _eagerly() -> AbstractContextManager[object]:
-    """Answer whole frames without compiled U-Nets, which would be compiled for that size anew."""
-    return torch.compiler.set_stance("force_eager")  # type: ignore[no-any-return]
-
-
-def _validate(model: Model, dataset: Path, place: torch.device) -> dict[str, float]:
-    """MAE (m) and mean angle (deg) on the first frames of the ``val`` split; empty where there is no such split."""
-    if not load_manifest(dataset).split("val"):
-        return {}
-    data = FrameDataset(dataset, "val", frames=1)
-    model.eval()
-    with _eagerly():
-        table = score({"model": model_method(model)}, data, place)[0]["model"].table()
-    model.train()
-    data.close()
-    if not table["depth"]["pixel"]["pixels"]:
-        return {}
-    return {"val_mae": table["depth"]["pixel"]["mae"], "val_angle_deg": table["normal"]["pixel"]["mean_deg"]}
+        with eagerly():
+            known["uncertainty"] = calibrate(run.model, run.dataset, run.group.device)
+    known |= write_card(run.out, run.config, run.model, run.dataset, run.group.device, known, run.minutes)
+    save_model(run.out / "model.safetensors", run.model, run.config, known)

@@ -1,95 +1,146 @@
-"""Tiles of a cloud on a grid with bounding boxes: for the few queries whose nearest neighbour may lie far away on the grid."""
+"""Exact nearest neighbours on a GPU, in Triton: all shifts and both ways in one launch, by tiles of 8 x 8 pixels.
+
+A program, one warp, answers for the 64 queries of one tile. It looks at the other cloud's tile in the same place, then at every
+tile whose bounding box is nearer than the worst answer so far, nearest box first. Boxes farther than each single query's own
+answer are skipped. What is left out cannot hold a nearer point.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
+import triton
+import triton.language as tl
 from torch import Tensor
 
-TILE = 8  # pixels
-AT_ONCE = 2_000_000  # distances per step
+from tofcapture_model.losses.chamfer.neighbours import Found, image_of, pixels_of, tiles_of
+
+SIDE = 8
+POINTS = SIDE**2
+PART = 8  # points that all queries are compared with at once: registers hold the distances
+BLOCK = 256  # boxes that are looked at together
 
 
-def squared_distances(cloud: Tensor, index: Tensor, queries: Tensor) -> Tensor:
-    """(N, M) squared distances of queries (3, N) to points of cloud (3, H W) at index (N, M)."""
-    total = torch.zeros(index.shape, device=cloud.device)
-    flat = index.flatten()
-    for points, query in zip(cloud, queries, strict=True):
-        apart = points.index_select(0, flat).view(index.shape) - query[:, None]
-        total.addcmul_(apart, apart)
-    return total
+@torch.no_grad()
+def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> Found:
+    """Answer as :func:`tofcapture_model.losses.chamfer.neighbours.nearest` does, on a GPU."""
+    size = (p_mask.shape[0], p_mask.shape[1])
+    clouds = [tiles_of(torch.where(m, c.float(), torch.inf), SIDE) for c, m in ((p, p_mask), (q, q_mask))]
+    points = torch.stack(clouds)
+    most = torch.where(points < torch.inf, points, -torch.inf).amax(-1)
+    boxes = torch.cat([points.amin(-1), most], dim=2).transpose(1, 2).contiguous()
+    tiles, shape = points.shape[1], (len(shifts), 2, points.shape[1], POINTS)
+    squared = torch.empty(shape, device=p.device)
+    codes = torch.empty(shape, device=p.device, dtype=torch.int32)
+    # Triton launches on the current GPU, whichever the tensors are on
+    with torch.cuda.device_of(points):  # type: ignore[no-untyped-call]
+        search[(tiles, 2 * len(shifts))](
+            points, boxes, shifts.float().contiguous(), squared, codes, tiles,
+            POINTS=POINTS, PART=PART, BLOCK=BLOCK, num_warps=1,
+        )  # fmt: skip
+    index = pixels_of(image_of(codes, size, SIDE), size, SIDE)
+    return Found(image_of(squared, size, SIDE), index)
 
 
-class Tiles:
-    """Tiles of a cloud (3, H, W) with their bounding boxes, for queries that look far."""
+@triton.jit
+def search(
+    points,
+    boxes,
+    shifts,
+    squared,
+    codes,
+    tiles,
+    POINTS: tl.constexpr,
+    PART: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Find the nearest of P + s in Q (way 0) and of Q - s in P (way 1); grid (T, 2 S), whose second axis counts ``2 shift + way``.
 
-    def __init__(self, cloud: Tensor, mask: Tensor) -> None:
-        h, w = self.size = tuple(mask.shape)
-        self.cloud = cloud.flatten(1)
-        pad = (0, -w % TILE, 0, -h % TILE)
+    Parameters
+    ----------
+    points
+        (2, T, 3, 64) float32, both clouds by tiles, metres; what is masked is at infinity.
+    boxes
+        (2, 6, T) float32, least and greatest coordinates of every tile's points; of none inf and -inf.
+    shifts
+        (S, 3) float32, metres.
+    squared
+        (S, 2, T, 64) float32, written: m^2, -1 where masked.
+    codes
+        (S, 2, T, 64) int32, written: 64 times the tile of the nearest, plus its place there.
+    tiles
+        T.
+    POINTS, PART, BLOCK
+        The module's; Triton takes constants as arguments.
+    """
+    tile, job = tl.program_id(0), tl.program_id(1)
+    way = job % 2
+    other = 1 - way
+    sign = 1.0 - 2.0 * way
+    lane = tl.arange(0, POINTS)
+    own = points + (way * tiles + tile) * 3 * POINTS + lane
+    x, y, z = tl.load(own), tl.load(own + POINTS), tl.load(own + 2 * POINTS)
+    there = x < float("inf")
+    shift = shifts + 3 * (job // 2)
+    x = tl.where(there, x + sign * tl.load(shift), 0.0)
+    y = tl.where(there, y + sign * tl.load(shift + 1), 0.0)
+    z = tl.where(there, z + sign * tl.load(shift + 2), 0.0)
+    least_x, most_x = _extent(x, there)
+    least_y, most_y = _extent(y, there)
+    least_z, most_z = _extent(z, there)
 
-        def least(values: Tensor) -> Tensor:
-            there = torch.nn.functional.pad(torch.where(mask, values, torch.inf), pad, value=torch.inf)
-            return -torch.nn.functional.max_pool2d(-there[None], TILE)[0]
+    theirs = points + other * tiles * 3 * POINTS
+    corners = boxes + other * 6 * tiles
+    best = tl.where(there, float("inf"), -1.0)
+    found = tl.zeros((POINTS,), tl.int32)
+    best, found = _look(theirs, tile, x, y, z, best, found, POINTS, PART)
+    worst = tl.max(best, 0)
+    for start in range(0, tiles, BLOCK):
+        number = start + tl.arange(0, BLOCK)
+        bound = _apart(corners, number, tiles, least_x, most_x, least_y, most_y, least_z, most_z)
+        bound = tl.where(number == tile, float("inf"), bound)
+        nearest_box = tl.min(bound, 0)
+        while nearest_box < worst:
+            one = start + tl.argmin(bound, 0)
+            needed = _apart(corners, one + 0 * lane, tiles, x, x, y, y, z, z) < best
+            if tl.max(needed.to(tl.int32), 0) > 0:
+                best, found = _look(theirs, one, x, y, z, best, found, POINTS, PART)
+                worst = tl.max(best, 0)
+            bound = tl.where(number == one, float("inf"), bound)
+            nearest_box = tl.min(bound, 0)
 
-        low, high = least(cloud), -least(-cloud)
-        self.grid = tuple(low.shape[1:])
-        self.low, self.high = low.flatten(1), high.flatten(1)
-        inside = torch.arange(TILE, device=cloud.device, dtype=torch.int32)
-        self.rows, self.cols = inside.repeat_interleave(TILE), inside.repeat(TILE)
+    out = (job * tiles + tile) * POINTS + lane
+    tl.store(squared + out, best)
+    tl.store(codes + out, found)
 
-    def search(
-        self, queries: Tensor, window: Sequence[Tensor], squared: Tensor, code: Tensor, side: int
-    ) -> tuple[Tensor, Tensor]:
-        """Nearest of queries (3, N) in rectangles (first, last column, first, last row) of at most ``side`` pixels."""
-        taps = side // TILE + 2
-        parts = torch.arange(len(squared), device=squared.device).split(max(AT_ONCE // taps**2, 1))  # type: ignore[no-untyped-call]
-        found = [self._part(queries[:, k], [a[k] for a in window], squared[k], code[k], taps) for k in parts]
-        if not found:
-            return squared, code
-        return torch.cat([f[0] for f in found]), torch.cat([f[1] for f in found])
 
-    def _part(
-        self, queries: Tensor, window: Sequence[Tensor], squared: Tensor, code: Tensor, taps: int
-    ) -> tuple[Tensor, Tensor]:
-        ramp = torch.arange(taps, device=squared.device, dtype=torch.int32)
-        cols, rows = (window[k][:, None] // TILE + ramp for k in (0, 2))
-        inside = (rows <= window[3][:, None] // TILE)[:, :, None] & (cols <= window[1][:, None] // TILE)[
-            :, None
-        ]
-        tile = torch.where(inside, rows[:, :, None] * self.grid[1] + cols[:, None], 0).flatten(1)
-        bound = torch.zeros(tile.shape, device=squared.device)
-        flat = tile.flatten()
-        for low, high, query in zip(self.low, self.high, queries, strict=True):
-            below = low.index_select(0, flat).view(tile.shape).sub_(query[:, None])
-            above = high.index_select(0, flat).view(tile.shape).sub_(query[:, None]).neg_()
-            short = torch.maximum(below, above, out=below).clamp_min_(0)
-            bound.addcmul_(short, short)
-        bound = torch.where(inside.flatten(1), bound, torch.inf)
-        first = bound.argmin(
-            1, keepdim=True
-        )  # the likeliest tile alone, which shrinks the sphere for the others
-        everyone = torch.arange(len(squared), device=squared.device)
-        squared, code = self._compare(queries, everyone, tile.gather(1, first)[:, 0], squared, code)
-        bound.scatter_(1, first, torch.inf)
-        who, which = (bound * (1 - 1e-5) < squared[:, None]).nonzero().unbind(1)
-        return self._compare(queries, who, tile[who, which], squared, code)
+@triton.jit
+def _extent(values, there):
+    """Least and greatest of the values that are there; inf and -inf of none."""
+    least = tl.min(tl.where(there, values, float("inf")), 0)
+    return least, tl.max(tl.where(there, values, -float("inf")), 0)
 
-    def _compare(
-        self, queries: Tensor, who: Tensor, tile: Tensor, squared: Tensor, code: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Compare queries ``who`` (M,) with all points of tiles (M,)."""
-        h, w = self.size
-        for part in torch.arange(len(who), device=who.device).split(AT_ONCE // TILE**2):  # type: ignore[no-untyped-call]
-            rows = (tile[part, None] // self.grid[1] * TILE + self.rows).clamp_max(h - 1)
-            cols = (tile[part, None] % self.grid[1] * TILE + self.cols).clamp_max(w - 1)
-            index = (rows * w + cols).int()
-            least, which = squared_distances(self.cloud, index, queries[:, who[part]]).min(1)
-            nearest_pixel = index.gather(1, which[:, None])[:, 0]
-            before = squared
-            squared = squared.scatter_reduce(0, who[part], least, "amin")
-            winner = (least == squared[who[part]]) & (least < before[who[part]])
-            code = code.clone()
-            code[who[part][winner]] = nearest_pixel[winner]
-        return squared, code
+
+@triton.jit
+def _apart(corners, number, tiles, x0, x1, y0, y1, z0, z1):
+    """Squared distance, from below, of tiles' boxes to the box from (x0, y0, z0) to (x1, y1, z1); inf beyond the last tile."""
+    inside, at, none = number < tiles, corners + number, float("inf")
+    x = tl.maximum(tl.load(at, inside, none) - x1, x0 - tl.load(at + 3 * tiles, inside, -none))
+    y = tl.maximum(tl.load(at + tiles, inside, none) - y1, y0 - tl.load(at + 4 * tiles, inside, -none))
+    z = tl.maximum(tl.load(at + 2 * tiles, inside, none) - z1, z0 - tl.load(at + 5 * tiles, inside, -none))
+    x, y, z = tl.maximum(x, 0.0), tl.maximum(y, 0.0), tl.maximum(z, 0.0)
+    return (x * x + y * y + z * z) * (1 - 1e-6)  # this sum and that of a distance may round apart
+
+
+@triton.jit
+def _look(theirs, tile, x, y, z, best, found, POINTS: tl.constexpr, PART: tl.constexpr):
+    """Compare all queries with all points of a tile; a lane keeps its queries, so that lanes need not agree."""
+    for start in tl.static_range(0, POINTS, PART):
+        at = theirs + tile * 3 * POINTS + start + tl.arange(0, PART)
+        dx = tl.load(at)[:, None] - x[None, :]
+        dy = tl.load(at + POINTS)[:, None] - y[None, :]
+        dz = tl.load(at + 2 * POINTS)[:, None] - z[None, :]
+        squares = dx * dx + dy * dy + dz * dz
+        least, which = tl.min(squares, 0, return_indices=True, return_indices_tie_break_left=False)
+        found = tl.where(least < best, tile * POINTS + start + which, found)
+        best = tl.minimum(best, least)
+    return best, found

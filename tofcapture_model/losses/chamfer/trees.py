@@ -1,227 +1,301 @@
-"""Exact nearest neighbours on the CPU, compiled, with the questions and answers of :mod:`tofcapture_model.losses.chamfer.neighbours`."""
+"""Exact nearest neighbours on the CPU: trees of bounding boxes over the pixel grid, sixteen points to a leaf, sixteen boxes to a node.
+
+A leaf is a tile of 4 x 4 pixels, a node one of 4 x 4 leaves or nodes. Sixteen boxes or points are tested by a few vector
+instructions. A query starts from a guess, mostly its neighbour's answer, and looks wherever a box is nearer than what it has.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
-from typing import Self, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tofcapture.errors import ConfigError
-from tofcapture_model.losses.chamfer.neighbours import Found
+from tofcapture.compiled import compiled
+from tofcapture_model.losses.chamfer.neighbours import Found, image_of, pixels_of, tiles_of
 
-T = TypeVar("T")
+Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+Point = tuple[np.float32, np.float32, np.float32]
 
-_SAMPLE = 32  # one of so many leaves is asked for every shift first,
-_TOGETHER = 4  # so many neighbours at a time
-_STEPS, _STEP = 16, 64  # at most so many steps in which other shifts are asked, of at least so many leaves
-_TASK = 64, 512  # leaves of a thread's task: least, most
-_WORTH_A_THREAD = 10_000  # queries of one shift
+SIDE, FAN = 4, 16
 _MARGIN = 1e-6  # of the largest coordinate: rounding of a shifted query
+_SAMPLE, _TOGETHER = (
+    32,
+    4,
+)  # one of so many leaves is asked for every shift first, so many neighbours at a time
+_STEPS, _STEP = 16, 64  # at most so many steps in which other shifts are asked, of at least so many leaves
+_TASK = 256  # leaves of a thread's task
+_WORTH_A_THREAD = 10_000  # queries of one shift
+
+_ZERO, _INF, _ONE = np.float32(0), np.float32(np.inf), np.uint32(1)
+_FACTOR, _TOP = (
+    np.uint32(0x077CB531),
+    np.uint32(27),
+)  # de Bruijn: the top five bits tell how far it was shifted
+_POSITION = np.zeros(32, np.int64)
+for _k in range(32):
+    _POSITION[(0x077CB531 << _k & 0xFFFFFFFF) >> 27] = _k
 
 
-def usable(device: torch.device) -> bool:
-    """Whether the compiled search runs there: on a CPU, with numba."""
-    if device.type != "cpu":
-        return False
-    try:
-        from tofcapture_model.losses.chamfer import boxes  # noqa: F401
-    except ConfigError:
-        return False
-    return True
+@compiled
+def _lowest(bits: np.uint32) -> int:
+    """Position of the lowest bit that is set."""
+    return _POSITION[np.uint32(np.uint32(bits & (~bits + _ONE)) * _FACTOR) >> _TOP]  # type: ignore[no-any-return]
 
 
-@dataclass(frozen=True)
-class Tree:
-    """A cloud as :mod:`tofcapture_model.losses.chamfer.leaves` builds it.
+@compiled
+def _boxes_near(boxes: Float32, g: int, p: Point, squared: np.float32) -> np.uint32:
+    """Bits of those of sixteen boxes that are nearer to p than a squared distance."""
+    x, y, z = p
+    bits = np.uint32(0)
+    for k in range(FAN):
+        dx = max(boxes[g, 0, k] - x, boxes[g, 3, k] + x, _ZERO)
+        dy = max(boxes[g, 1, k] - y, boxes[g, 4, k] + y, _ZERO)
+        dz = max(boxes[g, 2, k] - z, boxes[g, 5, k] + z, _ZERO)
+        bits |= np.uint32(dx * dx + dy * dy + dz * dz < squared) << np.uint32(k)
+    return bits
 
-    Attributes
-    ----------
-    leaves, boxes
-        (L, 3, 16) and (M, 6, 16) float32, metres.
-    offsets
-        int64, where the levels of boxes start, and M.
-    pixels
-        (N,) int64 flat pixels of the points.
+
+@compiled
+def _apart(leaves: Float32, g: int, k: int, p: Point, s: Point) -> np.float32:
+    """Squared distance of a point of a leaf to p + s; the shift is taken from the difference, where it rounds least."""
+    dx, dy, dz = (
+        (leaves[g, 0, k] - p[0]) - s[0],
+        (leaves[g, 1, k] - p[1]) - s[1],
+        (leaves[g, 2, k] - p[2]) - s[2],
+    )
+    return dx * dx + dy * dy + dz * dz
+
+
+@compiled
+def _look(leaves: Float32, g: int, p: Point, s: Point, best: np.float32, at: int) -> tuple[np.float32, int]:
+    """Look at a leaf: the least squared distance so far, and whose it is."""
+    bits = np.uint32(0)
+    for k in range(FAN):
+        bits |= np.uint32(_apart(leaves, g, k, p, s) < best) << np.uint32(k)
+    while bits:
+        k = _lowest(bits)
+        bits &= bits - _ONE
+        squared = _apart(leaves, g, k, p, s)
+        if squared < best:
+            best, at = squared, FAN * g + k
+    return best, at
+
+
+@compiled
+def _descend(
+    leaves: Float32, boxes: Float32, levels: Int64, node: Int64, open_: NDArray[np.uint32],
+    p: Point, s: Point, best: np.float32, at: int,
+) -> tuple[np.float32, int]:  # fmt: skip
+    """Look at all leaves whose box is nearer than what is known; ``node`` and ``open_`` (levels,) are for its use."""
+    moved = p[0] + s[0], p[1] + s[1], p[2] + s[2]
+    top = len(levels) - 1
+    level = top
+    node[level], open_[level] = 0, _boxes_near(boxes, levels[level, 0], moved, best)
+    while level <= top:
+        bits = open_[level]
+        if bits == 0:
+            level += 1
+            continue
+        k = _lowest(bits)
+        open_[level] = bits & (bits - _ONE)
+        row, col = node[level] // levels[level, 1], node[level] % levels[level, 1]
+        child = (SIDE * row + k // SIDE) * levels[level, 2] + SIDE * col + k % SIDE
+        if level > 0:
+            level -= 1
+            node[level], open_[level] = child, _boxes_near(boxes, levels[level, 0] + child, moved, best)
+        else:
+            best, at = _look(leaves, child, p, s, best, at)
+    return best, at
+
+
+@compiled
+def _search(
+    leaves: Float32, boxes: Float32, levels: Int64, own: Float32, shift: Point, which: Int64,
+    squared: Float32, whose: Int32, sums: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Find the nearest of the tree ``leaves, boxes, levels`` to the points of the leaves ``which`` of ``own`` + shift.
+
+    ``whose`` (L, 16) holds guesses and receives the answers, 16 times a leaf plus the place in it; ``squared`` (L, 16), m^2,
+    and ``sums`` (L,) of the squares of each leaf are written.
+    """
+    node, open_ = np.zeros(len(levels), np.int64), np.zeros(len(levels), np.uint32)
+    there = -1
+    for g in which:
+        total = 0.0
+        for k in range(FAN):
+            p = (own[g, 0, k], own[g, 1, k], own[g, 2, k])
+            if p[0] == _INF:
+                continue
+            at = int(whose[g, k])
+            best = _apart(leaves, at // FAN, at % FAN, p, shift)
+            if there >= 0:
+                best, at = _look(leaves, there, p, shift, best, at)
+            best, at = _descend(leaves, boxes, levels, node, open_, p, shift, best, at)
+            squared[g, k], whose[g, k] = best, at
+            total += float(best)
+            there = at // FAN
+        sums[g] = total
+
+
+@compiled
+def _bound(own: Float32, squared: Float32, away: float, sums: NDArray[np.float64]) -> None:
+    """Raise sums (L,) to what squares must at least add up to ``away`` metres from where they are these (L, 16)."""
+    for g in range(len(sums)):
+        total = 0.0
+        for k in range(FAN):
+            if own[g, 0, k] < _INF:
+                least = max(np.sqrt(float(squared[g, k])) * (1.0 - _MARGIN) - away, 0.0)
+                total += least * least
+        sums[g] = max(sums[g], total)
+
+
+class _Tree:
+    """A cloud's tree: leaves (L, 3, 16), boxes (M, 6, 16), and of each level of boxes its first, its width, its children's width.
+
+    A box is its least coordinates and its negated greatest, less a margin that covers the rounding of a shifted query.
     """
 
-    leaves: NDArray[np.float32]
-    boxes: NDArray[np.float32]
-    offsets: NDArray[np.int64]
-    pixels: NDArray[np.int64]
-
-
-def plant(cloud: Tensor, mask: Tensor) -> Tree:
-    """Build the tree of the masked points of a cloud (3, H, W), metres; mask (H, W) is not empty."""
-    from tofcapture_model.losses.chamfer.leaves import FAN, fill, tidy, wrap
-
-    points, there = np.ascontiguousarray(cloud.float().numpy()), np.ascontiguousarray(mask.numpy())
-    n = int(np.count_nonzero(there))
-    levels = [-(-n // FAN)]
-    while len(levels) == 1 or levels[-1] > 1:
-        levels.append(-(-levels[-1] // FAN))
-    offsets = np.cumsum([0, *levels[1:]], dtype=np.int64)
-    leaves, pixels = np.empty((levels[0], 3, FAN), np.float32), np.empty(n, np.int64)
-    boxes = np.empty((offsets[-1], 6, FAN), np.float32)
-    fill(points, there, leaves, pixels)
-    tidy(leaves, pixels)
-    finite = leaves.reshape(-1)[np.isfinite(leaves.reshape(-1))]
-    wrap(leaves, n, offsets, np.float32(_MARGIN * max(abs(finite.min()), abs(finite.max()))), boxes)
-    return Tree(leaves, boxes, offsets, pixels)
+    def __init__(self, cloud: Tensor, mask: Tensor) -> None:
+        there = torch.where(mask, cloud, torch.inf)
+        largest = float(torch.where(mask, cloud, 0.0).abs().max())
+        leaves = tiles_of(there, SIDE)
+        h, w = (-(-n // SIDE) for n in mask.shape)
+        corners = torch.cat(
+            [leaves.amin(2), torch.where(leaves < torch.inf, -leaves, torch.inf).amin(2)], dim=1
+        )
+        corners = corners.T.reshape(6, h, w) - _MARGIN * largest
+        boxes, levels, start = [], [], 0
+        while not levels or h * w > 1:
+            boxes.append(tiles_of(corners, SIDE))
+            width, h, w = w, -(-h // SIDE), -(-w // SIDE)
+            levels.append((start, w, width))
+            start += h * w
+            corners = boxes[-1].amin(2).T.reshape(6, h, w)
+        self.leaves, self.boxes = leaves.numpy(), torch.cat(boxes).numpy()
+        self.levels, self.count = np.array(levels), int(mask.sum())
 
 
 class _Shift:
-    """What is known of one shift: answers of P in Q (way 0) and of Q in P, in the order of the leaves of who asks."""
+    """What is known of one shift: answers of P in Q (way 0) and of Q in P, by the leaves of who asks."""
 
-    def __init__(self, trees: tuple[Tree, Tree], move: tuple[float, float, float]) -> None:
+    def __init__(self, trees: tuple[_Tree, _Tree], move: Sequence[float]) -> None:
+        shape = (len(trees[0].leaves), FAN)
         self.trees, self.move = trees, move
-        self.squared = [np.empty(len(tree.pixels), np.float32) for tree in trees]
-        self.whose = [np.empty(len(tree.pixels), np.int32) for tree in trees]
-        self.guesses = [np.empty(0, np.int32) for _ in trees]
-        # of the squares of a leaf; a bound from below until it is asked
-        self.sums = [np.zeros(len(tree.leaves)) for tree in trees]
+        self.squared = np.zeros((2, *shape), np.float32)
+        self.whose = np.broadcast_to(
+            np.arange(math.prod(shape), dtype=np.int32).reshape(shape), (2, *shape)
+        ).copy()
+        self.sums = np.zeros(
+            (2, len(trees[0].leaves))
+        )  # of a leaf's squares; a bound from below until it is asked
 
-    def ask(self, way: int, which: NDArray[np.int64]) -> None:
+    def ask(self, way: int, which: Int64) -> None:
         """Find the neighbours of the points of some leaves, ascending."""
-        from tofcapture_model.losses.chamfer.boxes import search
-
         own, other, sign = self.trees[way], self.trees[1 - way], 1 - 2 * way
         x, y, z = (np.float32(sign * a) for a in self.move)
-        search(
-            other.leaves, other.boxes, other.offsets, own.leaves, (x, y, z), which,
-            self.guesses[way], self.squared[way], self.whose[way], self.sums[way],
+        _search(
+            other.leaves, other.boxes, other.levels, own.leaves, (x, y, z), which,
+            self.squared[way], self.whose[way], self.sums[way],
         )  # fmt: skip
 
     def learn(self, known: _Shift) -> None:
         """Take the answers of another shift as guesses, and as bounds: none changes by more than the shift does."""
-        from tofcapture_model.losses.chamfer.boxes import bound
-
         apart = math.dist(self.move, known.move)
         apart += _MARGIN * (math.hypot(*self.move) + math.hypot(*known.move))
-        self.guesses = known.whose
-        for sums, squared in zip(self.sums, known.squared, strict=True):
-            bound(squared, apart, sums)
+        self.whose[:] = known.whose
+        for way in (0, 1):
+            _bound(self.trees[way].leaves, known.squared[way], apart, self.sums[way])
+
+    def shares(self) -> NDArray[np.float64]:
+        """(2, L) parts of the symmetric mean squared distance, m^2; from below until everything was asked."""
+        return np.stack([sums / tree.count for sums, tree in zip(self.sums, self.trees, strict=True)])
 
     def seen(self) -> float:
         """Symmetric mean squared distance, m^2; from below until everything was asked."""
-        (p, q), (of_p, of_q) = self.trees, self.sums
-        return float(of_p.sum() / len(p.pixels) + of_q.sum() / len(q.pixels))
+        return float(self.shares().sum())
 
-    def found(self, shape: tuple[int, int]) -> Found:
-        """Answers as tensors."""
-        from tofcapture_model.losses.chamfer.boxes import spread
 
-        size = shape[0] * shape[1]
-        squared, index = np.zeros((2, size), np.float32), np.zeros((2, size), np.int64)
+class _Asking:
+    """Trees of two clouds, what is known of every shift, and threads that ask; answers do not depend on their number."""
+
+    def __init__(self, p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> None:
+        self.size = (p_mask.shape[0], p_mask.shape[1])
+        workers = min(torch.get_num_threads(), 1 + int(p_mask.sum() + q_mask.sum()) // _WORTH_A_THREAD)
+        self.pool = ThreadPoolExecutor(workers) if workers > 1 else None
+        trees = (_Tree(p, p_mask), _Tree(q, q_mask))
+        self.shifts = [_Shift(trees, move) for move in shifts.tolist()]
+        self.leaves = len(trees[0].leaves)
+
+    def ask(self, shifts: Sequence[_Shift], which: NDArray[np.bool_]) -> None:
+        """Ask the leaves ``which`` (2, L) of P and of Q for some shifts."""
+        tasks: list[Callable[[], None]] = []
         for way in (0, 1):
-            own, other = self.trees[way].pixels, self.trees[1 - way].pixels
-            spread(own, other, self.squared[way], self.whose[way], squared[way], index[way])
-        return Found(torch.from_numpy(squared).view(2, *shape), torch.from_numpy(index).view(2, *shape))
-
-
-class _Crew:
-    """Threads that share tasks; the answers do not depend on how many there are."""
-
-    def __init__(self, p_mask: Tensor, q_mask: Tensor) -> None:
-        queries = int(np.count_nonzero(p_mask.numpy()) + np.count_nonzero(q_mask.numpy()))
-        size = min(torch.get_num_threads(), 1 + queries // _WORTH_A_THREAD)
-        self.pool = ThreadPoolExecutor(size) if size > 1 else None
-
-    def do(self, tasks: Sequence[Callable[[], T]]) -> list[T]:
-        """Results of all tasks, in their order."""
-        if self.pool is None:
-            return [task() for task in tasks]
-        return [future.result() for future in [self.pool.submit(task) for task in tasks]]
-
-    def ask(self, shifts: Sequence[_Shift], which: Sequence[NDArray[np.int64]]) -> None:
-        """Ask some leaves of P and some of Q, ascending, for all shifts."""
-        least, most = _TASK
-        tasks = []
-        for way, leaves in enumerate(which):
-            n = min(max(len(leaves) // 8, least), most)
-            parts = [leaves[k : k + n] for k in range(0, len(leaves), n)]
+            leaves = which[way].nonzero()[0]
+            parts = [leaves[k : k + _TASK] for k in range(0, len(leaves), _TASK)]
             tasks += [partial(shift.ask, way, part) for shift in shifts for part in parts]
-        self.do(tasks)
+        if self.pool is None:
+            for task in tasks:
+                task()
+        else:
+            list(self.pool.map(lambda task: task(), tasks))
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def found(self, shifts: Sequence[_Shift]) -> Found:
+        """End the threads and join the answers to images."""
         if self.pool is not None:
             self.pool.shutdown()
-
-
-def _plan(crew: _Crew, p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> list[_Shift]:
-    tree_p, tree_q = crew.do([partial(plant, p, p_mask), partial(plant, q, q_mask)])
-    return [_Shift((tree_p, tree_q), (x, y, z)) for x, y, z in shifts.tolist()]
-
-
-def _steps(best: _Shift) -> list[list[NDArray[np.int64]]]:
-    """Leaves of P and of Q in the order in which other shifts ask: bounds are loose where the best one's squares are large."""
-    weights = [sums / len(tree.pixels) for sums, tree in zip(best.sums, best.trees, strict=True)]
-    order, n = np.argsort(-np.concatenate(weights), kind="stable"), len(weights[0])
-    steps = np.array_split(order, min(max(len(order) // _STEP, 1), _STEPS))
-    return [[step[step < n], step[step >= n] - n] for step in map(np.sort, steps)]
+        squared, codes = (
+            torch.from_numpy(np.stack(x)) for x in zip(*((s.squared, s.whose) for s in shifts), strict=True)
+        )
+        return Found(
+            image_of(squared, self.size, SIDE), pixels_of(image_of(codes, self.size, SIDE), self.size, SIDE)
+        )
 
 
 @torch.no_grad()
-def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> list[Found]:
-    """Find the nearest neighbours of every p + s in Q and of every q in P + s, exactly.
-
-    Parameters
-    ----------
-    p, q
-        (3, H, W) points, metres, on the CPU; finite where masked.
-    p_mask, q_mask
-        (H, W) bool: which pixels belong to the clouds; neither is empty.
-    shifts
-        (S, 3) metres.
-
-    Returns
-    -------
-    One Found per shift
-    """
-    with _Crew(p_mask, q_mask) as crew:
-        plans = _plan(crew, p, q, p_mask, q_mask, shifts)
-        crew.ask(plans, [np.arange(len(tree.leaves)) for tree in plans[0].trees])
-    return [plan.found((p.shape[1], p.shape[2])) for plan in plans]
+def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> Found:
+    """Answer as :func:`tofcapture_model.losses.chamfer.neighbours.nearest` does, on the CPU."""
+    asking = _Asking(p, q, p_mask, q_mask, shifts)
+    asking.ask(asking.shifts, np.ones((2, asking.leaves), bool))
+    return asking.found(asking.shifts)
 
 
 @torch.no_grad()
 def nearest_of_best(
     p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor
 ) -> tuple[int, Found, Tensor]:
-    """Find the shift of the least symmetric mean squared distance, and its neighbours, exactly (arguments as :func:`nearest`).
+    """Find the shift of the least symmetric mean squared distance, and its neighbours, exactly.
 
-    A sample tells which shift is probably the best, and that one is asked everything. By the triangle inequality its answers
-    bound those of the others from below; answers take the place of bounds until the sum is above the best one's, which proves
-    that the shift cannot win.
+    A sample of leaves tells the likeliest shift, which is asked everything. By the triangle inequality its answers bound those
+    of the others from below. Answers replace bounds until a shift's sum exceeds the best one's: it cannot win.
 
     Returns
     -------
-    index of the shift, its Found, (S,) m^2: its distance, and for every other shift a bound from below that is not less
+    index of the shift, its Found (1, 2, H, W), (S,) m^2: its distance, and for every other shift a bound from below
     """
-    with _Crew(p_mask, q_mask) as crew:
-        plans = _plan(crew, p, q, p_mask, q_mask, shifts)
-        sampled = [np.arange(len(tree.leaves)) // _TOGETHER % _SAMPLE == 0 for tree in plans[0].trees]
-        crew.ask(plans, [there.nonzero()[0] for there in sampled])
-        best, *others = sorted(plans, key=_Shift.seen)
-        crew.ask([best], [(~there).nonzero()[0] for there in sampled])
-        for plan in others:
-            plan.learn(best)
-        least = best.seen()
-        for step in _steps(best):
-            others = [plan for plan in others if plan.seen() < least]
-            if not others:
-                break
-            crew.ask(others, step)
+    asking = _Asking(p, q, p_mask, q_mask, shifts)
+    sample = np.broadcast_to(np.arange(asking.leaves) // _TOGETHER % _SAMPLE == 0, (2, asking.leaves))
+    asking.ask(asking.shifts, sample)
+    best, *others = sorted(asking.shifts, key=_Shift.seen)
+    asking.ask([best], ~sample)
+    for shift in others:
+        shift.learn(best)
+    # bounds are loosest where the best one's squares are large: these leaves are asked first
+    order = np.argsort(-best.shares().ravel(), kind="stable")
+    for some in np.array_split(order, min(max(len(order) // _STEP, 1), _STEPS)):
+        others = [shift for shift in others if shift.seen() < best.seen()]
+        if not others:
+            break
+        step = np.zeros(2 * asking.leaves, bool)
+        step[some] = True
+        asking.ask(others, step.reshape(2, -1))
     best = min([best, *others], key=_Shift.seen)
-    bounds = torch.tensor([plan.seen() for plan in plans], dtype=torch.float32)
-    return plans.index(best), best.found((p.shape[1], p.shape[2])), bounds
+    scores = torch.tensor([shift.seen() for shift in asking.shifts], dtype=torch.float32)
+    return asking.shifts.index(best), asking.found([best]), scores

@@ -1,8 +1,7 @@
 """MRM of FLAT: Guo, Frosio, Gallo, Zickler, Kautz, "Tackling 3D ToF Artifacts Through Learning and the FLAT Dataset", ECCV 2018.
 
-A kernel-predicting network mixes the raw channels of every pixel into corrected ones, which the camera's own arithmetic then
-decodes, both frequencies and unwrapping included; the loss is on the depth, so the decoding is differentiable. Its flow module (MOM)
-is for moving scenes and is left out.
+A kernel-predicting network mixes the raw channels of every pixel into corrected ones, which the camera's own arithmetic
+decodes, differentiably, as the loss is on the depth. Its flow module (MOM) is for moving scenes and is left out.
 """
 
 from __future__ import annotations
@@ -11,10 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from tofcapture_model.data.frame import Estimate, Frame, Target, expect_channels
-from tofcapture_model.losses.losses import masked_mean
-from tofcapture_model.networks.baselines.decoding import decode
-from tofcapture_model.networks.baselines.protocol import Baseline
+from tofcapture_model.frame import Estimate, Frame, Target, expect_channels
+from tofcapture_model.losses import masked_mean
+from tofcapture_model.networks.baselines import Baseline, decode
 from tofcapture_model.networks.unet import pad_to_multiple
 
 _SLOPE = 0.1
@@ -23,28 +21,14 @@ ENCODER = ((7, 64), (5, 64), (5, 64), (5, 128), (3, 128), (3, 128), (3, 256), (3
 """Kernel and channels of the ten convolutions; every third halves the resolution after the first of its level."""
 _POOLED = (0, 3, 6, 9)
 _UP = (
-    (3, 256, 9),
-    (3, 256, 8),
-    (3, 256, 7),
-    (3, 128, 6),
-    (3, 128, 5),
-    (3, 128, 4),
-    (5, 64, 3),
-    (5, 64, 2),
-    (5, 64, 1),
-    (7, 64, 0),
-)
+    (3, 256, 9), (3, 256, 8), (3, 256, 7), (3, 128, 6), (3, 128, 5),
+    (3, 128, 4), (5, 64, 3), (5, 64, 2), (5, 64, 1), (7, 64, 0),
+)  # fmt: skip
 _SKIP = {9: 8, 6: 5, 3: 2}
 
 
 class MRM(Baseline):
-    """Multi-reflection module; 11,018,648 parameters for eight raw channels.
-
-    Parameters
-    ----------
-    channels
-        Raw channels.
-    """
+    """Multi-reflection module; 11,018,648 parameters for eight raw channels."""
 
     def __init__(self, channels: int = 8) -> None:
         super().__init__()
@@ -64,15 +48,13 @@ class MRM(Baseline):
             if level in _SKIP:
                 self.skips[str(level)] = nn.Conv2d(2 * out, 2 * out, 3, padding=1)
                 width = 2 * out
-        kernel = channels * (
-            channels + 1
-        )  # a mixing matrix and biases, which the release predicts and does not add
+        kernel = channels * (channels + 1)  # a matrix and biases, which the release predicts and does not add
         self.head = nn.ModuleList(nn.Conv2d(a, kernel, 3, padding=1) for a in (width, kernel, kernel))
         self.apply(_initialise)
         nn.init.zeros_(self.head[-1].weight)  # type: ignore[arg-type]
 
     def estimate_depth(self, frame: Frame) -> Tensor:
-        """Decode the mixed channels of both frequencies, relative to the frame's own decoding: calibration stays the camera's."""
+        """Decode the mixed channels, relative to the frame's own decoding: calibration stays the camera's."""
         expect_channels(frame.raw, self.channels, "guo2018")
         kernels = self.kernels(frame.raw).float()
         with torch.autocast(frame.raw.device.type, enabled=False):
@@ -81,7 +63,7 @@ class MRM(Baseline):
         return decode(frame, low, high)[0]
 
     def kernels(self, raw: Tensor) -> Tensor:
-        """(B, C, C, H, W) mixing matrices about the identity: an untrained network changes nothing."""
+        """Predict mixing matrices (B, C, C, H, W) about the identity: an untrained network changes nothing."""
         h, w = raw.shape[-2:]
         x, (top, left) = pad_to_multiple(raw, 16)
         skips: list[Tensor] = []
@@ -103,7 +85,7 @@ class MRM(Baseline):
         return mix + torch.eye(c, device=x.device).reshape(1, c, c, 1, 1)  # type: ignore[no-any-return]
 
     def loss(self, estimate: Estimate, target: Target, frame: Frame) -> Tensor:
-        """Root mean square error over the mask, metres."""
+        """Compute the root mean square error over the mask, metres."""
         del frame
         return (masked_mean((estimate.depth - target.depth).square(), target.good) + 1e-12).sqrt()
 

@@ -1,7 +1,7 @@
 """LF2 for two frequencies: the classical pipeline of libfreenect2's decoder, which Guo 2018 compares with; nothing is learned.
 
-Joint bilateral filter of the phasors, unwrapping of what it yields, rejection by residual, depth, edge filter. Calibration is that of
-the frame: the filtered phasors turn its ranges by their change of phase. Low amplitudes, frequencies that disagree and edges are given up.
+Joint bilateral filter of the phasors, unwrapping, rejection by residual, depth, edge filter. Calibration is that of the frame.
+Low amplitudes, frequencies that disagree and edges are given up.
 """
 
 from __future__ import annotations
@@ -12,12 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
-from tofcapture_model.data.frame import Frame
-from tofcapture_model.geometry.intrinsics import scale_intrinsics
-from tofcapture_model.geometry.maps import depth_to_normals, metres_per_radian, shifted
-from tofcapture_model.networks.baselines.decoding import decode
-from tofcapture_model.networks.baselines.protocol import NEAREST, NORMAL_RADIUS
-from tofcapture_model.networks.baselines.sensor import upsample_depth
+from tofcapture_model.frame import Frame
+from tofcapture_model.geometry.maps import metres_per_radian, shifted
+from tofcapture_model.networks.baselines import NEAREST, decode, fine_normals, upsample_depth
 
 GAUSSIAN = (0.1070, 0.1131, 0.1070, 0.1131, 0.1196, 0.1131, 0.1070, 0.1131, 0.1070)
 RANGE = 1.442695 * 5.0  # of the phase distance (1 - cos) / 2
@@ -50,16 +47,13 @@ def estimate(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
     edge = flying(depth, amplitude) | (torch.maximum(low_apart, high_apart) >= _APART)
     kept = (frame.valid > 0) & ~dark & ~edge & ~disagreeing(frame, gap, torch.maximum(faint, amplitude))
     depth = upsample_depth(depth)
-    normals = depth_to_normals(
-        depth, torch.ones_like(depth), scale_intrinsics(frame.intrinsics, 2), NORMAL_RADIUS
-    )
-    return depth, normals, F.interpolate(kept.float(), scale_factor=2, mode="nearest") > 0
+    return depth, fine_normals(depth, frame), F.interpolate(kept.float(), scale_factor=2, mode="nearest") > 0
 
 
 def disagreeing(frame: Frame, gap: Tensor, amplitude: Tensor) -> Tensor:
-    """(B, 1, H, W) bool: phases further from those of any range than LF2 tolerates at this amplitude, the larger of the two.
+    """Mark phases further from those of any range than LF2 tolerates at this amplitude, the larger of the two: (B, 1, H, W) bool.
 
-    The residual is the distance, in radians, of the two unwrapped phases from the line along which they grow with the range.
+    The residual is the distance, radians, of the two unwrapped phases from the line along which they grow with the range.
     """
     residual = gap.abs() / torch.hypot(metres_per_radian(frame, 0), metres_per_radian(frame, 1))
     tolerated = torch.exp(_SLOPE * (_COUNTS * amplitude).clamp_min(1e-9).log() + _OFFSET)
@@ -67,7 +61,7 @@ def disagreeing(frame: Frame, gap: Tensor, amplitude: Tensor) -> Tensor:
 
 
 def bilateral(phasor: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean of the 3 x 3 phasors (B, 2, H, W), weighted by distance and by agreement in phase; (B, 1, H, W) sum of phase distances."""
+    """Average 3 x 3 phasors (B, 2, H, W) by distance and agreement in phase; with the (B, 1, H, W) sum of phase distances."""
     amplitude = phasor.square().sum(1, keepdim=True).sqrt()
     direction = phasor / amplitude.clamp_min(1e-9)
     total, weights, distance = (torch.zeros_like(x) for x in (phasor, amplitude, amplitude))
@@ -82,7 +76,7 @@ def bilateral(phasor: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def flying(depth: Tensor, amplitude: Tensor) -> Tensor:
-    """(B, 1, H, W) bool: rough amplitude and a step in depth to both sides, the edge filter of LF2."""
+    """Mark rough amplitudes with a step in depth to both sides, (B, 1, H, W) bool: the edge filter of LF2."""
     around = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     a = torch.cat([shifted(amplitude, *s) for s in around], dim=1)
     d = torch.cat([shifted(depth, *s) for s in around], dim=1)

@@ -1,10 +1,9 @@
 """ToFNet: Su, Heide, Wetzstein, Heidrich, "Deep End-to-End Time-of-Flight Imaging", CVPR 2018.
 
-The generator as released: residual encoder-decoder without normalisation, additive skips, tanh over the depth range. Its input are unit
-phasors of two frequencies. In the released recipe the discriminator never sees the depth, so that its gradient is zero; what trains
-the generator is l1 and an edge-weighted total variation, and so it does here. One thing differs: as released it starts in the middle of the tanh, at
-5 m, and on a rig that works below 1.5 m the first hundred steps drive the tanh into saturation, from where it does not come back
-(116 steps of ours ended at 6 cm everywhere). It starts at ``START`` here.
+The generator as released: residual encoder-decoder without normalisation, additive skips, tanh over the depth range. It reads
+unit phasors of two frequencies. In the released recipe the discriminator never sees the depth: l1 and an edge-weighted total
+variation train the generator, and so they do here. One thing differs. As released it starts in the middle of the tanh, at 5 m,
+and on a rig below 1.5 m the first hundred steps drive it into saturation for good. It starts at ``START`` here.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from tofcapture_model.data.frame import Estimate, Frame, Target
-from tofcapture_model.losses.losses import masked_mean
-from tofcapture_model.networks.baselines.protocol import Baseline
+from tofcapture_model.frame import Estimate, Frame, Target
+from tofcapture_model.losses import masked_mean
+from tofcapture_model.networks.baselines import Baseline
 from tofcapture_model.networks.unet import pad_to_multiple
 
 FAR = 10.0  # m, range of the tanh, as released
@@ -48,15 +47,7 @@ class _Residual(nn.Module):
 
 
 class ToFNet(Baseline):
-    """Generator of ToFNet; 12,028,225 parameters at width 64.
-
-    Parameters
-    ----------
-    width
-        Channels at full resolution.
-    blocks
-        Residual blocks at a quarter of the resolution.
-    """
+    """Generator of ToFNet; 12,028,225 parameters at width 64, with ``blocks`` residual ones at a quarter of the resolution."""
 
     def __init__(self, width: int = 64, blocks: int = 9) -> None:
         super().__init__()
@@ -76,7 +67,7 @@ class ToFNet(Baseline):
         nn.init.constant_(self.last[-1].bias, math.atanh(2 * START / FAR - 1))  # type: ignore[arg-type]
 
     def estimate_depth(self, frame: Frame) -> Tensor:
-        """From unit phasors alone; the decoded depth is not read."""
+        """Compute depth from unit phasors alone; the decoded depth is not read."""
         h, w = frame.depth.shape[-2:]
         x, (top, left) = pad_to_multiple(unit_phasors(frame), 4)
         skip2 = self.first(x)
@@ -89,19 +80,19 @@ class ToFNet(Baseline):
         return out[..., top : top + h, left : left + w]
 
     def loss(self, estimate: Estimate, target: Target, frame: Frame) -> Tensor:
-        """L1 + TV where the amplitude is smooth, both in units of half the range as in the release."""
+        """Add l1 and TV where the amplitude is smooth, both in units of half the range as in the release."""
         l1 = masked_mean((estimate.depth - target.depth).abs(), target.good)
         return (l1 + TV * weighted_variation(estimate.depth, frame)) / (FAR / 2)
 
 
 def unit_phasors(frame: Frame) -> Tensor:
-    """(B, 4, H, W): I and Q of each frequency divided by their amplitude."""
+    """Divide I and Q of each frequency by their amplitude: (B, 4, H, W)."""
     pairs = frame.phasor.chunk(2, dim=1)
     return torch.cat([z / (z.square().sum(1, keepdim=True).sqrt() + _FAINT) for z in pairs], dim=1)
 
 
 def weighted_variation(depth: Tensor, frame: Frame) -> Tensor:
-    """Mean of ``sqrt((w_x dx)^2 + (w_y dy)^2)`` with ``w = exp(-|grad amplitude|)``, amplitude stretched to [0, 1]; metres."""
+    """Average ``sqrt((w_x dx)^2 + (w_y dy)^2)``, ``w = exp(-|grad amplitude|)``, amplitude stretched to [0, 1]; metres."""
     amplitude = frame.phasor[:, :2].square().sum(1, keepdim=True).sqrt()
     least, most = amplitude.amin((2, 3), keepdim=True), amplitude.amax((2, 3), keepdim=True)
     smooth = F.interpolate(

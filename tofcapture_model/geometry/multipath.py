@@ -1,7 +1,6 @@
-"""What the physics of light says about the depth error of a frame, before anything is learned.
+"""Cues: what the physics of light says about the depth error of a frame, before anything is learned.
 
-Four maps in metres, computed from whole frames (crops do not show the rest of the scene): diffuse interreflection, the halo of the
-lens, and the two frequencies' disagreement. Networks read them and learn how far to believe them.
+They are computed from whole frames, as crops do not show the rest of the scene. Networks learn how far to believe them.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _FAINT = 1e-3  # of saturation; below it an amplitude is noise
 
 
 def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: Tensor, hz: float) -> Tensor:
-    """Stack the four maps.
+    """Stack four maps of expected depth errors.
 
     Parameters
     ----------
@@ -41,7 +40,8 @@ def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: 
 
     Returns
     -------
-    (B, 4, H, W) metres: error by interreflection of what is seen, the same with the scene continued beyond the image, error by the halo if all light were in it, gap averaged over a wide window
+    (B, 4, H, W) metres: error by interreflection of what is seen; the same with the scene continued beyond the image; error by
+    the halo if all light were in it; gap averaged over a wide window
     """
     high = phasor[:, 2:]
     amplitude = high.square().sum(1, keepdim=True).sqrt()
@@ -69,22 +69,10 @@ def _blur(image: Tensor, radius: int) -> Tensor:
 
 
 def halo_error(phasor: Tensor, hz: float, shrink: int = 6) -> Tensor:
-    """Depth error if the lens scattered all light of the image once over each pixel, to first order.
+    """Return the depth error (B, 1, H, W), within +-1 m, if the lens scattered all light of the image once over each pixel.
 
-    A halo adds ``kappa (z * h)`` to the phasor z; the error of a small share kappa is kappa times this map.
-
-    Parameters
-    ----------
-    phasor
-        (B, 2, H, W) I and Q.
-    hz
-        Modulation frequency.
-    shrink
-        Pixels per cell of the blurred image; the halo is blurred over some ten cells.
-
-    Returns
-    -------
-    (B, 1, H, W) metres, within +-1
+    A halo adds ``kappa (z * h)`` to the phasor z (B, 2, H, W); the error of a small share kappa is kappa times this map.
+    ``shrink`` is pixels per cell of the blurred image; the halo is blurred over some ten cells.
     """
     cells = F.avg_pool2d(phasor, shrink, ceil_mode=True, count_include_pad=False)
     halo = F.interpolate(_blur(cells, 5), size=phasor.shape[-2:], mode="bilinear", align_corners=False)
@@ -94,7 +82,7 @@ def halo_error(phasor: Tensor, hz: float, shrink: int = 6) -> Tensor:
 
 
 def surface(depth: Tensor, valid: Tensor, amplitude: Tensor, intrinsics: Tensor) -> Tensor:
-    """Tangent plane and albedo of every pixel (B, 5, H, W): unit normal, ``n . p`` in metres, albedo by the measured amplitude."""
+    """Fit every pixel's tangent plane and albedo (B, 5, H, W): unit normal, ``n . p`` in metres, albedo by the amplitude."""
     planes, _ = side_window_planes(depth, valid + 1e-3, 2)
     ray = rays(intrinsics, *depth.shape[-2:])
     normals = plane_normals(planes, intrinsics, ray)
@@ -112,12 +100,10 @@ def exchange_error(
 ) -> Tensor:
     """Estimate the depth error of diffuse interreflection (after Fuchs 2010 and Jimenez 2014, whom the paper names).
 
-    The visible patches are a closed world of Lambertian surfaces: radiosity ``x = rho (E + K x)`` with the sensor's irradiance
-    ``E_p = cos_p / d_p^2 e^{i k d_p / 2}`` and ``K_pq = cos_pq cos_qp / (pi r^2) dS_q e^{i k r / 2}``; albedos come from the
-    measured amplitudes and one constant of the sensor. The error is the angle of ``1 + (K x)_p / E_p``: the albedo of the
-    patch itself cancels.
-
-    Occlusion between patches and what lies out of sight are not in it.
+    The visible patches are a closed world of Lambertian surfaces: radiosity ``x = rho (E + K x)`` with the irradiance
+    ``E_p = cos_p / d_p^2 e^{i k d_p / 2}`` and ``K_pq = cos_pq cos_qp / (pi r^2) dS_q e^{i k r / 2}``. Albedos come from the
+    amplitudes and one constant of the sensor. The error is the angle of ``1 + (K x)_p / E_p``, in which the patch's own albedo
+    cancels. Occlusion between patches and what lies out of sight are not in it.
 
     Parameters
     ----------
@@ -130,8 +116,7 @@ def exchange_error(
     step
         Pixels per patch; time goes with its inverse fourth power.
     margin
-        Patches that are added beyond each border on the planes of the border, since the table does not end where the image
-        does; right where the scene goes on, too much where it does not.
+        Patches that are added beyond each border on the planes of the border: the table does not end where the image does.
 
     Returns
     -------
@@ -153,9 +138,9 @@ def exchange_error(
 
 
 def _patches(grid: Tensor, height: int, width: int, margin: int) -> tuple[Tensor, Tensor]:
-    """Rays (B, 3, H, W) of a grid with ``margin`` more pixels at each border, and pixels per unit of the plane z = 1 (B, H, W).
+    """Return rays (B, 3, H, W) of a grid with ``margin`` more pixels at each border, and pixels per unit of z = 1 (B, H, W).
 
-    A lens is known inside its image only, and many fold outside: beyond the border it goes on as it is there, straight.
+    A lens is known inside its image only, and many fold outside: beyond the border it goes on straight.
     """
     r = rays(grid, height, width)
     x, y = r[:, :2].unbind(1)
@@ -171,7 +156,7 @@ def _patches(grid: Tensor, height: int, width: int, margin: int) -> tuple[Tensor
 
 
 def _exchange(maps: Tensor, r: Tensor, density: Tensor, hz: float) -> Tensor:
-    """Depth error (N,) of patches (5, N): normal, plane distance, albedo; rays (3, N); patches per unit of the plane z = 1 (N,)."""
+    """Depth error (N,) of patches (5, N) as :func:`surface` has them; rays (3, N); patches per unit of the plane z = 1 (N,)."""
     n = maps[:3].T
     slope = (maps[:3] * r).sum(0).clamp_max(-_GRAZING / 2)
     z = (maps[3] / slope).clamp(0.1, _FAR)

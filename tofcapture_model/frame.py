@@ -1,4 +1,4 @@
-"""What a network reads and what it is held against: batches of frames and of targets."""
+"""What a network reads, what it is held against, and what it answers: batches of frames, targets and estimates."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class Frame(NamedTuple):
     gap
         (B, 1, H, W) range of the low minus range of the high frequency, metres: the multipath cue.
     cues
-        (B, 4, H, W) depth errors that physics expects, metres: see :func:`tofcapture_model.networks.multipath.cues`.
+        (B, 4, H, W) depth errors that physics expects, metres: :func:`tofcapture_model.geometry.multipath.cues`.
     modulation
         (B, 2) low and high modulation frequency, Hz.
     intrinsics
-        (B, 4) fx, fy, cx, cy in pixels of the (H, W) grid, or (B, 9) where there is a lens: :mod:`tofcapture_model.geometry.intrinsics`.
+        (B, 4 or 9) of the (H, W) grid, pixels: :mod:`tofcapture_model.geometry.intrinsics`.
     demodulation
         (B, 4, K) weights that turn taps into ``phasor``.
     """
@@ -68,7 +68,7 @@ class Target(NamedTuple):
     good
         (B, 1, 2H, 2W) bool: no mask bit is set; what metrics are taken over.
     context
-        (B, 1, 2H, 2W) bool: measured surface outside the object crop; extra supervision, never evaluated.
+        (B, 1, 2H, 2W) bool: measured surface outside the object crop; supervises, is never evaluated.
     """
 
     depth: Tensor
@@ -85,8 +85,8 @@ class Estimate(NamedTuple):
     depth, normals
         (B, 1, 2H, 2W) metres and (B, 3, 2H, 2W) unit camera-facing, after refinement.
     error
-        (B, 1, 2H, 2W) how far off the depth may be, metres, positive: its expected absolute error where ``losses.uncertainty`` is ``l1`` (paper), one
-        sigma, within which 68 % of the errors should be, where it is ``laplace`` (compact).
+        (B, 1, 2H, 2W) metres, positive. With ``losses.uncertainty`` ``l1`` (paper) the expected absolute error of the depth;
+        with ``laplace`` (compact) one sigma, within which 68 % of the errors should be.
     initial_depth, initial_normals
         The same before refinement.
     """
@@ -99,7 +99,7 @@ class Estimate(NamedTuple):
 
 
 def expect_channels(raw: Tensor, channels: int, network: str) -> None:
-    """Say what to do where a network is given another camera's raw channels (B, K, H, W) than it was made for.
+    """Refuse another camera's raw channels (B, K, H, W) than a network was made for.
 
     Raises
     ------

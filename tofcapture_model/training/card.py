@@ -1,4 +1,4 @@
-"""The card of a training run: ``README.md`` beside the weights says what was trained on what, for how long, and how well it went."""
+"""Write the card of a training run: ``README.md`` beside the weights says what was trained on what, and how well it went."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from tofcapture.files.manifest import load_manifest
 from tofcapture.files.seal import write_text
 from tofcapture.files.shard import ShardReader
 from tofcapture_model.config import Config, config_to_dict, preset, presets
-from tofcapture_model.networks.zoo import Model
-from tofcapture_model.training.runlog import read_metrics
+from tofcapture_model.networks import Model
+from tofcapture_model.networks.checkpoint import DIGITS
+from tofcapture_model.training import read_metrics
 
 ROWS = 12  # of a curve
-_TRUNCATE = 12  # digits of a digest that are enough to recognise it
 
 
 def write_card(
@@ -49,41 +49,31 @@ def write_card(
     -------
     What the checkpoint should remember beside ``provenance``: ``device``, ``torch``.
     """
-    rows = read_metrics(Path(out) / "metrics.jsonl")
-    facts = {
-        "device": device_name(device),
-        "torch": torch.__version__,
-    }
+    facts = {"device": _device_name(device), "torch": torch.__version__}
+    rows = read_metrics(out / "metrics.jsonl")
     parts = [
-        f"# {Path(out).resolve().name}: {config.network.kind}",
+        f"# {out.resolve().name}: {config.network.kind}",
         _about(config, model, {**provenance, **facts}),
-        "## Data\n\n" + _data(Path(dataset), provenance),
+        "## Data\n\n" + _data(dataset, provenance),
         "## Configuration\n\n" + _configuration(config),
         "## Curves\n\n" + _curves(rows),
         "## Go on\n\n" + _commands(out, dataset, provenance, minutes),
     ]
-    write_text(Path(out) / "README.md", "\n\n".join(parts) + "\n")
+    write_text(out / "README.md", "\n\n".join(parts) + "\n")
     return facts
 
 
-def budget(provenance: Mapping[str, Any]) -> dict[str, float]:
-    """Minutes and steps that trained a checkpoint, by its provenance; what is not known is left out."""
-    return {key: float(provenance[key]) for key in ("minutes", "steps") if provenance.get(key)}
-
-
-def device_name(device: torch.device) -> str:
+def _device_name(device: torch.device) -> str:
     """Name a device as people know it, with the threads or processes that worked on it."""
     world = int(os.environ.get("WORLD_SIZE", "1"))
-    name = (
-        torch.cuda.get_device_name(device)
-        if device.type == "cuda"
-        else f"{device.type}, {_count(torch.get_num_threads(), 'thread')}"
-    )
+    name = f"{device.type}, {_count(torch.get_num_threads(), 'thread')}"
+    if device.type == "cuda":
+        name = torch.cuda.get_device_name(device)
     return name if world == 1 else f"{world} x {name}"
 
 
-def _count(number: int, what: str, many: str = "") -> str:
-    return f"{number:,} {what if number == 1 else many or what + 's'}"
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -92,9 +82,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _about(config: Config, model: Model, known: Mapping[str, Any]) -> str:
-    begun = (
-        f"`{known['start']}` (sha256 {known['start_sha256'][:_TRUNCATE]})" if "start" in known else "nothing"
-    )
+    begun = f"`{known['start']}` (sha256 {known['start_sha256'][:DIGITS]})" if "start" in known else "nothing"
     losses = ", ".join(f"{name} {value:.4g}" for name, value in known.get("losses", {}).items())
     rows = [
         ("network", f"{config.network.kind}, {sum(p.numel() for p in model.parameters()):,} parameters"),
@@ -115,11 +103,9 @@ def _data(dataset: Path, known: Mapping[str, Any]) -> str:
     manifest = load_manifest(dataset)
     rows = []
     for split in SPLITS:
-        entries = manifest.split(split)
-        views = sum(entry.views for entry in entries.values())
-        rows.append(
-            (split, f"{len(entries)}", f"{views}", _frames([dataset / e.path for e in entries.values()]))
-        )
+        entries = manifest.split(split).values()
+        frames = _frames([dataset / entry.path for entry in entries])
+        rows.append((split, str(len(entries)), str(sum(entry.views for entry in entries)), frames))
     said = f"`{dataset}`, sha256 of its manifest {known.get('manifest_sha256', 'unknown')}"
     for other, digest in known.get("also", {}).items():
         said += f"; the split train of `{other}`, {digest}, was learned from, too"
@@ -139,7 +125,7 @@ def _frames(shards: Sequence[Path]) -> str:
 
 
 def closest_preset(config: Config) -> tuple[str, dict[str, tuple[Any, Any]]]:
-    """The preset that differs least from a configuration, and where: key, the preset's value, the configuration's."""
+    """Find the preset that differs least from a configuration, and where: key, the preset's value, the configuration's."""
     mine = dict(_flat(config_to_dict(config)))
     found = []
     for name in presets():
