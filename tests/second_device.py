@@ -58,6 +58,13 @@ class Watched(TorchDispatchMode):
         return _run(func, args, kwargs or {})
 
 
+class Here(torch.Generator):
+    """Draws on the host: the second device draws no numbers of its own."""
+
+    def __new__(cls, _device=None):
+        return super().__new__(cls)
+
+
 def _run(func, args, kwargs):
     leaves = [x for x in tree_leaves((args, kwargs)) if isinstance(x, torch.Tensor)]
     there = any(isinstance(x, There) for x in leaves)
@@ -98,8 +105,7 @@ def main(dataset: Path, out: Path) -> None:
     from tofcapture_model.evaluation.suite import run_suite
     from tofcapture_model.training.train import train
 
-    here = torch.Generator
-    torch.Generator = lambda _device=None: here()  # it draws no numbers of its own
+    torch.Generator = Here
     demo = preset("demo")
     drawn = replace(demo.training, batch=1, crop=(48, 64), noise="drawn", phase_error=0.003, validate_every=1)
     weights = {}
