@@ -93,26 +93,15 @@ def _folds(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float]) ->
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics of a camera.
+    """Intrinsics of a camera."""
 
-    Attributes
-    ----------
-    width, height
-        Image size in pixels.
-    fx, fy
-        Focal lengths in pixels.
-    cx, cy
-        Principal point in pixels, pixel centres at integers.
-    distortion
-        OpenCV's k1, k2, p1, p2, k3; empty for a pinhole or a rectified image.
-    """
-
-    width: int
+    width: int  #: Image size in pixels.
     height: int
-    fx: float
+    fx: float  #: Focal lengths in pixels.
     fy: float
-    cx: float
+    cx: float  #: Principal point in pixels, pixel centres at integers.
     cy: float
+    #: OpenCV's k1, k2, p1, p2, k3; empty for a pinhole or a rectified image.
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:

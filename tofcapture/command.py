@@ -14,21 +14,12 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command hands back.
+    """What a command hands back."""
 
-    Attributes
-    ----------
-    data
-        JSON-serialisable result, printed as one object on stdout under ``--json``.
-    text
-        What a person reads on stdout without ``--json``.
-    exit_code
-        0 unless the command succeeded in finding something wrong (``check``).
-    """
-
+    #: JSON-serialisable result, printed as one object on stdout under ``--json``.
     data: dict[str, Any] = field(default_factory=dict)
-    text: str = ""
-    exit_code: int = 0
+    text: str = ""  #: What a person reads on stdout without ``--json``.
+    exit_code: int = 0  #: 0 unless the command succeeded in finding something wrong (``check``).
 
 
 @dataclass(frozen=True)

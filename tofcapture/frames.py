@@ -40,57 +40,30 @@ TOF_FLAG_DOCS = {
 
 @dataclass(frozen=True)
 class TofInfo:
-    """What a ToF driver says of its camera without opening it.
+    """What a ToF driver says of its camera without opening it."""
 
-    Attributes
-    ----------
-    model, serial
-        Free text.
-    camera
-        Intrinsics.
-    illuminator
-        (3,) light source in the ToF frame, metres.
-    modulation_hz, phase_rad
-        (8,) frequency and demodulation phase of each raw channel: ``C_k = B + A cos(phi + phase_rad[k])``.
-    exposure
-        Integration time of one phase image, seconds.
-    saturation
-        Raw value from which a tap is saturated.
-    range_errors
-        The camera's factory calibration, one per frequency; empty when it has none.
-    """
-
-    model: str
+    model: str  #: Free text.
     serial: str
-    camera: Camera
-    illuminator: Float64
+    camera: Camera  #: Intrinsics.
+    illuminator: Float64  #: (3,) light source in the ToF frame, metres.
+    #: (K,) frequency and demodulation phase of each raw channel: ``C_k = B + A cos(phi + phase_rad[k])``.
     modulation_hz: tuple[float, ...] = PAPER_MODULATION_HZ
     phase_rad: tuple[float, ...] = PAPER_PHASE_RAD
-    exposure: float = 400e-6
-    saturation: float = 4095.0
+    exposure: float = 400e-6  #: Integration time of one phase image, seconds.
+    saturation: float = 4095.0  #: Raw value from which a tap is saturated.
+    #: The camera's factory calibration, one per frequency; empty when it has none.
     range_errors: tuple[RangeError, ...] = ()
 
 
 @dataclass(frozen=True)
 class TofBurst:
-    """Raw phase images of one static burst.
+    """Raw phase images of one static burst."""
 
-    Attributes
-    ----------
-    raw
-        (frames, 8, H, W): uint16 as the sensor gave it (float64 only from an ideal simulation).
-    time_ns
-        (frames,) int64, monotonic clock.
-    celsius
-        (frames,) float64 sensor temperature, NaN when the sensor does not say.
-    info
-        The camera that took it.
-    """
-
+    #: (frames, K, H, W): uint16 as the sensor gave it (float64 only from an ideal simulation).
     raw: NDArray[Any]
-    time_ns: NDArray[np.int64]
-    celsius: Float64
-    info: TofInfo
+    time_ns: NDArray[np.int64]  #: (frames,) int64, monotonic clock.
+    celsius: Float64  #: (frames,) float64 sensor temperature, NaN when the sensor does not say.
+    info: TofInfo  #: The camera that took it.
 
     def __post_init__(self) -> None:
         shape = (len(self.time_ns), len(self.info.modulation_hz), *self.info.camera.shape)
@@ -112,21 +85,11 @@ class StereoInfo:
 
 @dataclass(frozen=True)
 class StereoFrame:
-    """One organised point map.
+    """One organised point map."""
 
-    Attributes
-    ----------
-    points
-        (H, W, 3) float32, stereo frame, metres; NaN where nothing was measured.
-    time_ns
-        int, monotonic clock.
-    info
-        The camera that took it.
-    """
-
-    points: NDArray[np.float32]
-    time_ns: int
-    info: StereoInfo
+    points: NDArray[np.float32]  #: (H, W, 3) float32, stereo frame, metres; NaN where nothing was measured.
+    time_ns: int  #: int, monotonic clock.
+    info: StereoInfo  #: The camera that took it.
 
     def __post_init__(self) -> None:
         expected = (*self.info.camera.shape, 3)
@@ -144,21 +107,11 @@ class ArmInfo:
 
 @dataclass(frozen=True)
 class ArmState:
-    """Where the arm says it is.
+    """Where the arm says it is."""
 
-    Attributes
-    ----------
-    joints
-        (6,) measured joint angles, radians.
-    T_base_flange
-        (4, 4), from the measured joints.
-    time_ns
-        int, monotonic clock.
-    """
-
-    joints: Float64
-    T_base_flange: Float64
-    time_ns: int
+    joints: Float64  #: (6,) measured joint angles, radians.
+    T_base_flange: Float64  #: (4, 4), from the measured joints.
+    time_ns: int  #: int, monotonic clock.
 
     def __post_init__(self) -> None:
         check_transform(self.T_base_flange, "arm state: T_base_flange")
@@ -166,54 +119,29 @@ class ArmState:
 
 @dataclass(frozen=True)
 class Truth:
-    """What only a simulator knows of a view.
+    """What only a simulator knows of a view."""
 
-    Attributes
-    ----------
-    depth
-        (2H, 2W) float32, exact depth at the pixel centres of the ToF plane at twice its resolution, metres; NaN for
-        rays that hit nothing.
-    normals
-        (2H, 2W, 3) float32, geometric normals in the ToF frame, unit, facing the camera.
-    target
-        (2H, 2W) bool, the ray hits the scene's object (not table or background).
-    T_tof_stereo, T_flange_tof
-        (4, 4) of the true rig.
-    """
-
+    #: (2H, 2W) float32, exact depth at the pixel centres of the ToF plane at twice its resolution, metres;
+    #: NaN for rays that hit nothing.
     depth: NDArray[np.float32]
+    #: (2H, 2W, 3) float32, geometric normals in the ToF frame, unit, facing the camera.
     normals: NDArray[np.float32]
-    target: NDArray[np.bool_]
-    T_tof_stereo: Float64
+    target: NDArray[np.bool_]  #: (2H, 2W) bool, the ray hits the scene's object (not table or background).
+    T_tof_stereo: Float64  #: (4, 4) of the true rig.
     T_flange_tof: Float64
 
 
 @dataclass(frozen=True)
 class View:
-    """Everything captured at one pose of one scene.
+    """Everything captured at one pose of one scene."""
 
-    Attributes
-    ----------
-    scene, index
-        Name of the scene (``calibration`` for board views), number of the view from 0.
-    tof, stereo
-        What the cameras handed over.
-    arm_before, arm_after
-        Arm state before the first and after the last exposure.
-    rig
-        The rig as it was known when the view was taken.
-    provenance
-        Strings and numbers: versions, seed, plan digest, UTC time ...
-    truth
-        Only from a simulator.
-    """
-
-    scene: str
+    scene: str  #: Name of the scene (``calibration`` for board views), number of the view from 0.
     index: int
-    tof: TofBurst
+    tof: TofBurst  #: What the cameras handed over.
     stereo: StereoFrame
-    arm_before: ArmState
+    arm_before: ArmState  #: Arm state before the first and after the last exposure.
     arm_after: ArmState
-    rig: Rig
+    rig: Rig  #: The rig as it was known when the view was taken.
+    #: Strings and numbers: versions, seed, plan digest, UTC time ...
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    truth: Truth | None = None
+    truth: Truth | None = None  #: Only from a simulator.

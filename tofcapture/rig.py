@@ -25,33 +25,20 @@ class RangeError:
     ``error = offset + scale r + sum_m (a_m cos m phi + b_m sin m phi) + per_pixel_radius * px + sum_ij c_ij x^i y^j +
     per_kelvin * (T - T_ref) + per_inverse_amplitude / A`` with r the range in metres, phi = 4 pi f r / c, px the pixel's distance
     to the principal point, x and y the pixel's place from -1 to 1 across the image, A the amplitude (docs: method 0.4).
-
-    Attributes
-    ----------
-    modulation_hz
-        The frequency it belongs to.
-    offset, scale
-        Metres, metres per metre.
-    harmonics
-        ``(m, a_m, b_m)``: order, cosine and sine amplitude in metres ("wiggling").
-    per_pixel_radius
-        Metres per pixel of distance to the principal point.
-    per_kelvin
-        Metres per kelvin away from ``reference_celsius``.
-    image
-        ``(i, j, c_ij)``: powers of x and y, and metres; what a pixel measures too long for its place in the image.
-    per_inverse_amplitude
-        Metres times raw units of amplitude: what dark surfaces are measured too far.
     """
 
-    modulation_hz: float
-    offset: float = 0.0
+    modulation_hz: float  #: The frequency it belongs to.
+    offset: float = 0.0  #: Metres, metres per metre.
     scale: float = 0.0
+    #: ``(m, a_m, b_m)``: order, cosine and sine amplitude in metres ("wiggling").
     harmonics: tuple[tuple[int, float, float], ...] = ()
-    per_pixel_radius: float = 0.0
-    per_kelvin: float = 0.0
+    per_pixel_radius: float = 0.0  #: Metres per pixel of distance to the principal point.
+    per_kelvin: float = 0.0  #: Metres per kelvin away from ``reference_celsius``.
     reference_celsius: float = 45.0
+    #: ``(i, j, c_ij)``: powers of x and y, and metres; what a pixel measures too long for its place in the
+    #: image.
     image: tuple[tuple[int, int, float], ...] = ()
+    #: Metres times raw units of amplitude: what dark surfaces are measured too far.
     per_inverse_amplitude: float = 0.0
 
     def at(
@@ -128,28 +115,15 @@ def image_places(camera: Camera) -> Float64:
 
 @dataclass(frozen=True)
 class Rig:
-    """Calibrated constants.
+    """Calibrated constants."""
 
-    Attributes
-    ----------
-    tof, stereo
-        Intrinsics.
-    illuminator
-        (3,) position of the ToF camera's light source in the ToF frame, metres.
-    T_tof_stereo
-        (4, 4) stereo frame to ToF frame.
-    T_flange_tof
-        (4, 4) ToF frame to flange frame.
-    range_errors
-        One per modulation frequency; empty when nothing is known.
-    """
-
-    tof: Camera
+    tof: Camera  #: Intrinsics.
     stereo: Camera
-    T_tof_stereo: Float64
-    T_flange_tof: Float64
+    T_tof_stereo: Float64  #: (4, 4) stereo frame to ToF frame.
+    T_flange_tof: Float64  #: (4, 4) ToF frame to flange frame.
+    #: (3,) position of the ToF camera's light source in the ToF frame, metres.
     illuminator: Float64 = field(default_factory=lambda: np.zeros(3))
-    range_errors: tuple[RangeError, ...] = ()
+    range_errors: tuple[RangeError, ...] = ()  #: One per modulation frequency; empty when nothing is known.
 
     def __post_init__(self) -> None:
         self.stereo.pinhole("rig.stereo (a point map's grid is rectified)")

@@ -39,29 +39,16 @@ PARALLEL = 0.05  # share of the points that makes a parallel plane below
 
 @dataclass(frozen=True)
 class Crop:
-    """Where the scene's object is, ToF frame.
+    """Where the scene's object is, ToF frame."""
 
-    Attributes
-    ----------
-    normal, offset
-        Table plane ``normal . p = offset``, unit normal towards the camera, metres; ``normal`` is NaN when there is no
-        dominant plane.
-    centre
-        (3,) what the camera looks at, metres.
-    radius
-        Largest distance from the centre along the table, metres.
-    clearance
-        Smallest height above the table, metres.
-    far
-        Largest depth, metres.
-    """
-
+    #: Table plane ``normal . p = offset``, unit normal towards the camera, metres; ``normal`` is NaN when
+    #: there is no dominant plane.
     normal: Float64
     offset: float
-    centre: Float64
-    radius: float
-    clearance: float
-    far: float
+    centre: Float64  #: (3,) what the camera looks at, metres.
+    radius: float  #: Largest distance from the centre along the table, metres.
+    clearance: float  #: Smallest height above the table, metres.
+    far: float  #: Largest depth, metres.
 
 
 def _plane_of(points: Float64) -> tuple[Float64, float]:

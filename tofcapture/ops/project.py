@@ -35,47 +35,29 @@ HIDES = 0.002  # m, and relative; a skirt hides the sheet when it is nearer by b
 
 @dataclass(frozen=True)
 class Sheet:
-    """A triangulated stereo depth image.
+    """A triangulated stereo depth image."""
 
-    Attributes
-    ----------
-    depth
-        (SH, SW) float64, stereo frame, metres; holes are bridged along rows, NaN outside the outermost points of a row.
-    vertex
-        (SH, SW) bool, measured, or interpolated across a small hole of a smooth surface.
-    surface
-        (SH-1, SW-1) bool, the quad between four neighbours is surface; other quads with four depths are skirt.
-    doubtful
-        (SH, SW) bool, interpolated across a small hole whose ends differ by more than neighbours on one surface can: a step
-        may hide in it.
-    """
-
+    #: (SH, SW) float64, stereo frame, metres; holes are bridged along rows, NaN outside the outermost points
+    #: of a row.
     depth: Float64
-    vertex: Bool
+    vertex: Bool  #: (SH, SW) bool, measured, or interpolated across a small hole of a smooth surface.
+    #: (SH-1, SW-1) bool, the quad between four neighbours is surface; other quads with four depths are skirt.
     surface: Bool
+    #: (SH, SW) bool, interpolated across a small hole whose ends differ by more than neighbours on one
+    #: surface can: a step may hide in it.
     doubtful: Bool
 
 
 @dataclass(frozen=True)
 class Projection:
-    """What the ToF camera's rays meet.
+    """What the ToF camera's rays meet."""
 
-    Attributes
-    ----------
-    depth
-        (H, W) float64, metres; NaN: no surface.
-    pixels
-        (H, W, 2) float64, (u, v) on the stereo grid of the point that is met; NaN where depth is.
-    normals
-        (H, W, 3) float64, of the triangles (noisy), ToF frame, unit, facing the camera; NaN where depth is.
-    occluded, edge
-        (H, W) bool, reasons to mistrust the pixel.
-    """
-
-    depth: Float64
+    depth: Float64  #: (H, W) float64, metres; NaN: no surface.
+    #: (H, W, 2) float64, (u, v) on the stereo grid of the point that is met; NaN where depth is.
     pixels: Float64
+    #: (H, W, 3) float64, of the triangles (noisy), ToF frame, unit, facing the camera; NaN where depth is.
     normals: Float64
-    occluded: Bool
+    occluded: Bool  #: (H, W) bool, reasons to mistrust the pixel.
     edge: Bool
 
 

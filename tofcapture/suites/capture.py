@@ -32,22 +32,13 @@ from tofcapture.suites.scene import Scene
 
 @dataclass(frozen=True)
 class Job:
-    """One scene to capture.
+    """One scene to capture."""
 
-    Attributes
-    ----------
-    scene, seed
-        What stands there; the seed of its rig: one camera, one bracket, one arm.
-    views, frames
-        Views of the scene, ToF frames of each burst.
-    sim, provenance
-        Overrides of the simulator's constants for the whole dataset; what every view says of its origin.
-    """
-
-    scene: Scene
+    scene: Scene  #: What stands there; the seed of its rig: one camera, one bracket, one arm.
     seed: int
-    views: int
+    views: int  #: Views of the scene, ToF frames of each burst.
     frames: int
+    #: Overrides of the simulator's constants for the whole dataset; what every view says of its origin.
     sim: Mapping[str, Any]
     provenance: Mapping[str, Any]
 

@@ -54,35 +54,21 @@ def make_scene(
 
 @dataclass(frozen=True)
 class DatasetSpec:
-    """A dataset to simulate: everything that its bytes depend on, but for versions.
+    """A dataset to simulate: everything that its bytes depend on, but for versions."""
 
-    Attributes
-    ----------
-    suite, seed
-        The recipe and its seed.
-    scenes, views, frames
-        How many: scenes, views of each, ToF frames of each view.
-    meshes, mesh_unit
-        Files for the scenes of kind ``mesh``.
-    sim
-        Overrides of the simulator's constants, as in a station's ``[sim]``.
-    cameras
-        Rigs that the scenes take turns with: each its own brackets, factory calibration and fixed pattern, so that a network
-        cannot learn one camera by heart.
-    kinds
-        Kinds of scenes, in turns, instead of the recipe's pattern (tof100).
-    """
-
-    suite: str
+    suite: str  #: The recipe and its seed.
     seed: int
-    scenes: int
+    scenes: int  #: How many: scenes, views of each, ToF frames of each view.
     views: int = 25
     frames: int = 10
-    meshes: tuple[Path, ...] = ()
+    meshes: tuple[Path, ...] = ()  #: Files for the scenes of kind ``mesh``.
     mesh_unit: str = "mm"
+    #: Overrides of the simulator's constants, as in a station's ``[sim]``.
     sim: Mapping[str, Any] = field(default_factory=dict)
+    #: Rigs that the scenes take turns with: each its own brackets, factory calibration and fixed pattern, so
+    #: that a network cannot learn one camera by heart.
     cameras: int = 1
-    kinds: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()  #: Kinds of scenes, in turns, instead of the recipe's pattern (tof100).
 
     def recipe(self) -> Recipe:
         """Load the suite's recipe with the kinds that are wanted; :class:`ConfigError` when it has no such kind."""
@@ -113,34 +99,19 @@ class DatasetSpec:
 
 @dataclass(frozen=True)
 class Made:
-    """One finished scene, as ``simulation/<scene>.json`` says.
+    """One finished scene, as ``simulation/<scene>.json`` says."""
 
-    Attributes
-    ----------
-    scene, sha256, views
-        Name, digest of the shard, views in it.
-    task
-        :meth:`DatasetSpec.task` that it came from.
-    objects, facts
-        Identities of its objects, and what the recipe says of it.
-    cpu, seconds
-        CPU seconds by stage of the process that made it (``build`` is the shard's), and wall clock.
-    bytes
-        Of the shard.
-    config, versions
-        Of the builder.
-    """
-
-    scene: str
+    scene: str  #: Name, digest of the shard, views in it.
     sha256: str
     views: int
-    task: str
-    objects: list[str]
+    task: str  #: :meth:`DatasetSpec.task` that it came from.
+    objects: list[str]  #: Identities of its objects, and what the recipe says of it.
     facts: dict[str, Any]
+    #: CPU seconds by stage of the process that made it (``build`` is the shard's), and wall clock.
     cpu: dict[str, float]
     seconds: float
-    bytes: int
-    config: dict[str, Any]
+    bytes: int  #: Of the shard.
+    config: dict[str, Any]  #: Of the builder.
     versions: dict[str, str]
 
 

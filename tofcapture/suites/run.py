@@ -26,28 +26,15 @@ _CAPTURE = 0.7  # share of a view's work that is done when it is captured; the r
 
 @dataclass(frozen=True)
 class Simulated:
-    """What a run did.
+    """What a run did."""
 
-    Attributes
-    ----------
-    dataset
-        The folder.
-    made, kept
-        Scenes of this run, and those that were there.
-    splits
-        Split by scene.
-    gt
-        Error of the ground truth (:meth:`TruthError.table`), ``None`` when no shard knows it.
-    seconds
-        Wall clock of the run.
-    """
-
-    dataset: Path
-    made: tuple[Made, ...]
+    dataset: Path  #: The folder.
+    made: tuple[Made, ...]  #: Scenes of this run, and those that were there.
     kept: tuple[Made, ...]
-    splits: Mapping[str, str]
+    splits: Mapping[str, str]  #: Split by scene.
+    #: Error of the ground truth (:meth:`TruthError.table`), ``None`` when no shard knows it.
     gt: Mapping[str, Any] | None
-    seconds: float
+    seconds: float  #: Wall clock of the run.
 
 
 def simulate_dataset(

@@ -45,32 +45,17 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Scene:
-    """One scene of a suite, and how it is looked at.
+    """One scene of a suite, and how it is looked at."""
 
-    Attributes
-    ----------
-    name
-        Of the shard.
-    objects
-        Everything that stands there, world frame.
-    identities
-        Name of each target object; two scenes that share one belong to the same split.
-    poses
-        Where the ToF camera stands; ``None``: wherever the arm's plan says.
-    plan_name
-        Seeds the arm's plan: scenes of the same plan name are seen from the same poses.
-    sim
-        Overrides of the simulator's constants for this scene alone.
-    facts
-        What else the views' provenance says: kind, materials, angle, exposure ...
-    """
-
-    name: str
-    objects: tuple[SceneObject, ...]
+    name: str  #: Of the shard.
+    objects: tuple[SceneObject, ...]  #: Everything that stands there, world frame.
+    #: Name of each target object; two scenes that share one belong to the same split.
     identities: tuple[str, ...]
-    poses: Poses | None
-    plan_name: str
+    poses: Poses | None  #: Where the ToF camera stands; ``None``: wherever the arm's plan says.
+    plan_name: str  #: Seeds the arm's plan: scenes of the same plan name are seen from the same poses.
+    #: Overrides of the simulator's constants for this scene alone.
     sim: Mapping[str, Any] = field(default_factory=dict)
+    #: What else the views' provenance says: kind, materials, angle, exposure ...
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -25,18 +25,12 @@ _TILE = 4  # interleaved sampling: 4 x 4 neighbouring pixels use 16 different se
 
 @dataclass(frozen=True)
 class Light:
-    """Light at the pixels, per unit of radiant intensity of the illuminator.
+    """Light at the pixels, per unit of radiant intensity of the illuminator."""
 
-    Attributes
-    ----------
-    phasor
-        (F, H, W) complex128, albedo x irradiance phasor averaged over the pixel, with the phase of the whole path; 1/m^2.
-    steady
-        (H, W) float64, the same for unmodulated light.
-    """
-
+    #: (F, H, W) complex128, albedo x irradiance phasor averaged over the pixel, with the phase of the whole
+    #: path; 1/m^2.
     phasor: NDArray[np.complex128]
-    steady: Float64
+    steady: Float64  #: (H, W) float64, the same for unmodulated light.
 
 
 @dataclass(frozen=True)

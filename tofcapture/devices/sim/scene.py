@@ -29,28 +29,14 @@ _LIFT = 2e-5
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One Lambertian triangle mesh.
+    """One Lambertian triangle mesh."""
 
-    Attributes
-    ----------
-    vertices, triangles
-        (N, 3) float64, object frame, metres, and (M, 3) int indices into them.
-    albedo
-        Diffuse reflectance at the illuminator's wavelength, in [0, 1].
-    T_world_object
-        (4, 4).
-    target
-        True for the scene's object, False for table, walls and clutter.
-    name
-        For messages.
-    """
-
-    vertices: Float64
+    vertices: Float64  #: (N, 3) float64, object frame, metres, and (M, 3) int indices into them.
     triangles: Int64
-    albedo: float
-    T_world_object: Float64
-    target: bool = True
-    name: str = "object"
+    albedo: float  #: Diffuse reflectance at the illuminator's wavelength, in [0, 1].
+    T_world_object: Float64  #: (4, 4).
+    target: bool = True  #: True for the scene's object, False for table, walls and clutter.
+    name: str = "object"  #: For messages.
 
     def __post_init__(self) -> None:
         if self.vertices.ndim != 2 or self.vertices.shape[1] != 3 or not np.isfinite(self.vertices).all():
@@ -72,18 +58,12 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class Geometry:
-    """All triangles of a scene, merged, world frame.
+    """All triangles of a scene, merged, world frame."""
 
-    Attributes
-    ----------
-    corners, normals
-        (M, 3, 3) float64, metres, and (M, 3) float32 unit geometric normals by the winding.
-    albedo, owner, target
-        (M,) float32; int64 index of the scene object; bool, the triangle belongs to the scene's object.
-    """
-
+    #: (M, 3, 3) float64, metres, and (M, 3) float32 unit geometric normals by the winding.
     corners: NDArray[np.float64]
     normals: Float32
+    #: (M,) float32; int64 index of the scene object; bool, the triangle belongs to the scene's object.
     albedo: Float32
     owner: Int64
     target: NDArray[np.bool_]
@@ -114,21 +94,11 @@ def merge(objects: Sequence[SceneObject]) -> Geometry:
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays meet the scene, flat arrays of the same length.
+    """Where rays meet the scene, flat arrays of the same length."""
 
-    Attributes
-    ----------
-    distance
-        float32, metres along the unit ray; infinite where nothing was met.
-    triangle
-        int64, -1 where nothing was met.
-    uv
-        (N, 2) float32 barycentric coordinates of corners 1 and 2.
-    """
-
-    distance: Float32
-    triangle: Int64
-    uv: Float32
+    distance: Float32  #: float32, metres along the unit ray; infinite where nothing was met.
+    triangle: Int64  #: int64, -1 where nothing was met.
+    uv: Float32  #: (N, 2) float32 barycentric coordinates of corners 1 and 2.
 
     @property
     def found(self) -> NDArray[np.bool_]:

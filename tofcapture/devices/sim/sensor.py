@@ -25,54 +25,35 @@ _FEW = 200.0  # electrons; below, shot noise is drawn from the Poisson distribut
 
 @dataclass(frozen=True)
 class Sensor:
-    """Constants of the sensor; docs/simulator.md explains where they come from.
+    """Constants of the sensor; docs/simulator.md explains where they come from."""
 
-    Attributes
-    ----------
-    modulation_hz, phase_rad
-        (K,) frequency and demodulation phase of each raw channel.
-    signal, ambient
-        Raw units that a white surface (albedo 1) facing the camera at 1 m adds to each tap in the nominal exposure; raw units
-        added to each tap, not modulated.
-    contrast
-        (F,) demodulation contrast A / B of each frequency, ascending.
-    exposure, nominal_exposure
-        Seconds; the signal scales with their ratio.
-    electrons_per_unit, read_noise
-        Photo-electrons per raw unit; electrons, standard deviation, per tap.
-    full_scale
-        Largest raw value; taps clip there.
-    range_errors
-        True systematic error of each frequency (offset, wiggling, radius, temperature).
-    harmonics
-        ``(m, a_m)``: the correlation waveform is ``cos x + sum a_m cos m x``; a square wave on a square wave has 1/9, 1/25.
-    pixel_offset
-        Standard deviation of the fixed range offset of each pixel, metres.
-    scattering, scattering_radius
-        Share of the light that the lens scatters, and the scale of its halo as a share of the image width.
-    celsius, celsius_drift
-        Mean temperature and standard deviation of its frame-to-frame wander.
-    quantise, shot_noise
-        Round to whole raw units and clip at ``full_scale``, else raw is float64; draw Poisson numbers of electrons.
-    """
-
+    #: (K,) frequency and demodulation phase of each raw channel.
     modulation_hz: tuple[float, ...] = PAPER_MODULATION_HZ
     phase_rad: tuple[float, ...] = PAPER_PHASE_RAD
+    #: Raw units that a white surface (albedo 1) facing the camera at 1 m adds to each tap in the nominal
+    #: exposure; raw units added to each tap, not modulated.
     signal: float = 280.0
+    #: (F,) demodulation contrast A / B of each frequency, ascending.
     contrast: tuple[float, ...] = (0.85, 0.6)
-    exposure: float = 400e-6
+    exposure: float = 400e-6  #: Seconds; the signal scales with their ratio.
     nominal_exposure: float = 400e-6
     ambient: float = 20.0
-    electrons_per_unit: float = 16.0
+    electrons_per_unit: float = 16.0  #: Photo-electrons per raw unit; electrons, standard deviation, per tap.
     read_noise: float = 20.0
-    full_scale: float = 4095.0
+    full_scale: float = 4095.0  #: Largest raw value; taps clip there.
+    #: True systematic error of each frequency (offset, wiggling, radius, temperature).
     range_errors: tuple[RangeError, ...] = ()
+    #: ``(m, a_m)``: the correlation waveform is ``cos x + sum a_m cos m x``; a square wave on a square wave
+    #: has 1/9, 1/25.
     harmonics: tuple[tuple[int, float], ...] = ()
-    pixel_offset: float = 0.0005
+    pixel_offset: float = 0.0005  #: Standard deviation of the fixed range offset of each pixel, metres.
+    #: Share of the light that the lens scatters, and the scale of its halo as a share of the image width.
     scattering: float = 0.004
     scattering_radius: float = 0.15
-    celsius: float = 45.0
+    celsius: float = 45.0  #: Mean temperature and standard deviation of its frame-to-frame wander.
     celsius_drift: float = 0.3
+    #: Round to whole raw units and clip at ``full_scale``, else raw is float64; draw Poisson numbers of
+    #: electrons.
     quantise: bool = True
     shot_noise: bool = True
 

@@ -15,26 +15,18 @@ _CHUNK = 65_536  # pixels at a time: what they need stays in the cache
 
 @dataclass(frozen=True)
 class StereoModel:
-    """Constants of the stereo camera; docs/simulator.md explains where they come from.
+    """Constants of the stereo camera; docs/simulator.md explains where they come from."""
 
-    Attributes
-    ----------
-    baseline
-        Distance of the right eye along x, metres.
-    disparity_noise, correlation
-        Standard deviations in pixels: of disparities after matching (depth noise is ``z^2 / (f b)`` times it), and of the
-        Gaussian that correlates the noise, the matching window's doing.
-    grazing, darkest, far
-        Lost are surfaces seen at more than this angle from their normal, radians, of a lower albedo, or deeper, metres.
-    edge_outliers, dropout
-        Shares of points beside a depth edge that are matched wrongly, and of points lost anywhere.
-    """
-
-    baseline: float = 0.10
+    baseline: float = 0.10  #: Distance of the right eye along x, metres.
+    #: Standard deviations in pixels: of disparities after matching (depth noise is ``z^2 / (f b)`` times it),
+    #: and of the Gaussian that correlates the noise, the matching window's doing.
     disparity_noise: float = 0.025
     correlation: float = 1.5
+    #: Lost are surfaces seen at more than this angle from their normal, radians, of a lower albedo, or
+    #: deeper, metres.
     grazing: float = np.radians(78.0)
     darkest: float = 0.02
+    #: Shares of points beside a depth edge that are matched wrongly, and of points lost anywhere.
     edge_outliers: float = 0.3
     dropout: float = 0.001
     far: float = 3.0

@@ -29,23 +29,14 @@ _GOLDEN = (np.sqrt(5) - 1) / 2
 
 @dataclass(frozen=True)
 class Lamp:
-    """A point light.
+    """A point light."""
 
-    Attributes
-    ----------
-    position
-        (3,) world frame, metres.
-    axis
-        (3,) unit, where it points.
-    half_angle
-        Full strength within this angle of the axis, radians; from there a smooth step to nothing.
-    edge
-        Width of that step, radians. ``half_angle`` of pi is a lamp that shines equally in all directions.
-    """
-
-    position: NDArray[np.float64]
+    position: NDArray[np.float64]  #: (3,) world frame, metres.
+    #: (3,) unit, where it points.
     axis: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    #: Full strength within this angle of the axis, radians; from there a smooth step to nothing.
     half_angle: float = np.pi
+    #: Width of that step, radians. ``half_angle`` of pi is a lamp that shines equally in all directions.
     edge: float = 0.0
 
     def strength(self, towards: Float32) -> Float32 | float:
@@ -135,26 +126,14 @@ def turn(phase: NDArray[Any]) -> Complex64:
 
 @dataclass(frozen=True)
 class Patches:
-    """The surfaces cut into patches: each triangle in n x n barycentric cells, neighbouring cells of like normal joined.
+    """The surfaces cut into patches: each triangle in n x n barycentric cells, neighbouring cells of like normal joined."""
 
-    Attributes
-    ----------
-    divisions, first
-        (M,) n of each triangle, and where its cells begin in ``patch_of_cell``.
-    patch_of_cell
-        (C,) patch of each cell; -1 for cells outside the triangle.
-    cells, cell_area
-        (S,) indices of real cells, sorted by patch, and their areas, m^2.
-    start
-        (P + 1,) where each patch begins in ``cells``.
-    """
-
-    divisions: Int64
+    divisions: Int64  #: (M,) n of each triangle, and where its cells begin in ``patch_of_cell``.
     first: Int64
-    patch_of_cell: Int64
-    cells: Int64
+    patch_of_cell: Int64  #: (C,) patch of each cell; -1 for cells outside the triangle.
+    cells: Int64  #: (S,) indices of real cells, sorted by patch, and their areas, m^2.
     cell_area: NDArray[np.float64]
-    start: Int64
+    start: Int64  #: (P + 1,) where each patch begins in ``cells``.
 
     @property
     def count(self) -> int:

@@ -30,37 +30,20 @@ _STEEP = float(np.tan(np.radians(80)))
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """What the decoder yields, each (H, W).
+    """What the decoder yields, each (H, W)."""
 
-    Attributes
-    ----------
-    depth
-        float32, z, metres; NaN where a tap is saturated or nothing can be decoded.
-    confidence
-        float32, amplitude of the high frequency, raw units.
-    flags
-        uint8, bits of :class:`tofcapture.frames.TofFlag`; 0 is a good pixel.
-    """
-
-    depth: Float32
-    confidence: Float32
-    flags: NDArray[np.uint8]
+    depth: Float32  #: float32, z, metres; NaN where a tap is saturated or nothing can be decoded.
+    confidence: Float32  #: float32, amplitude of the high frequency, raw units.
+    flags: NDArray[np.uint8]  #: uint8, bits of :class:`tofcapture.frames.TofFlag`; 0 is a good pixel.
 
 
 @dataclass(frozen=True)
 class Signals:
-    """What was on the way from taps to depth.
+    """What was on the way from taps to depth."""
 
-    Attributes
-    ----------
-    phasor
-        (2, 2, H, W) float32: I and Q of the low, then of the high frequency; raw units.
-    gap
-        (H, W) float32: range of the low minus range of the high frequency, within half a range of the high one; metres, NaN
-        where there is no light.
-    """
-
-    phasor: Float32
+    phasor: Float32  #: (2, 2, H, W) float32: I and Q of the low, then of the high frequency; raw units.
+    #: (H, W) float32: range of the low minus range of the high frequency, within half a range of the high
+    #: one; metres, NaN where there is no light.
     gap: Float32
 
 

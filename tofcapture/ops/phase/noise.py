@@ -18,18 +18,10 @@ _ROUNDING = 1 / 12  # variance of rounding to whole raw units
 
 @dataclass(frozen=True)
 class TapNoise:
-    """Noise of one tap of one frame: variance ``tap / electrons_per_unit + read^2`` in raw units squared.
+    """Noise of one tap of one frame: variance ``tap / electrons_per_unit + read^2`` in raw units squared."""
 
-    Attributes
-    ----------
-    electrons_per_unit
-        Photo-electrons per raw unit.
-    read
-        Standard deviation of the electronics, raw units.
-    """
-
-    electrons_per_unit: float = 16.0
-    read: float = 1.25
+    electrons_per_unit: float = 16.0  #: Photo-electrons per raw unit.
+    read: float = 1.25  #: Standard deviation of the electronics, raw units.
 
 
 def photon_transfer(bursts: Iterable[NDArray[np.generic]], saturation: float) -> TapNoise:

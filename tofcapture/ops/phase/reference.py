@@ -20,23 +20,15 @@ _SETTLED = 1e-8  # m
 
 @dataclass(frozen=True)
 class Decoded:
-    """What decoding yields, float64.
+    """What decoding yields, float64."""
 
-    Attributes
-    ----------
-    radial
-        (H, W) distance from the ToF camera along the ray, metres; NaN where it cannot be decoded.
-    range_low, range_high
-        (H, W) half the path from the illuminator over the surface to the camera by either frequency, before fusion, metres.
-        The low one is wrapped at its own ambiguity, the high one is unwrapped.
-    amplitude
-        (2, H, W), raw units; that of the high frequency is the confidence.
-    """
-
+    #: (H, W) distance from the ToF camera along the ray, metres; NaN where it cannot be decoded.
     radial: Float64
+    #: (H, W) half the path from the illuminator over the surface to the camera by either frequency, before
+    #: fusion, metres. The low one is wrapped at its own ambiguity, the high one is unwrapped.
     range_low: Float64
     range_high: Float64
-    amplitude: Float64
+    amplitude: Float64  #: (2, H, W), raw units; that of the high frequency is the confidence.
 
 
 def decode(
