@@ -383,7 +383,7 @@ def test_command_dry_run_and_refusals(tmp_path, capsys, monkeypatch):
     assert main(["record", "--scene", "mug", "--views", "3", "--out", str(out), "--dry-run"]) == 0
     assert "3 of 3 views" in capsys.readouterr().out
     assert not out.exists()
-    monkeypatch.setattr("tofcapture.devices.sim.arm.SimArm.simulated", False)
+    monkeypatch.setattr("tofcapture.devices.sim.drivers.SimArm.simulated", False)
     assert main(["record", "--scene", "mug", "--out", str(out)]) == 4
     assert "--allow-motion" in capsys.readouterr().err
     assert main(["record", "--out", str(out)]) == 2

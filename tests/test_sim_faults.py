@@ -6,8 +6,7 @@ import pytest
 from tests.test_sim_world import SMALL
 from tofcapture.devices.kinematics import HOME
 from tofcapture.devices.registry import StationContext
-from tofcapture.devices.sim.arm import SimArm
-from tofcapture.devices.sim.drivers import SimStereo, SimTof
+from tofcapture.devices.sim.drivers import SimArm, SimStereo, SimTof
 from tofcapture.devices.sim.faults import FaultPlan, Faults, read_faults
 from tofcapture.devices.sim.world import shared_world
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused

@@ -28,60 +28,6 @@ CELL = 2  # pixels: windows start and end at cells, a quarter of the table's mem
 _MIN_SPREAD = 1e-4  # det / trace^2 of the window's rays; below, they are a line and the plane may swivel
 
 
-def _moments(depth: NDArray[np.floating], camera: Camera) -> Float64:
-    """Regression terms (H, W, 10): 1, x, y, xx, xy, yy, q, xq, yq, qq with q = 1 / depth; zero where NaN."""
-    if depth.shape != camera.shape:
-        raise DataError(f"normals: expected depth of shape {camera.shape}, got {depth.shape}")
-    valid = np.isfinite(depth) & (depth > 0)
-    q = np.divide(1.0, depth, out=np.zeros(camera.shape), where=valid, dtype=np.float64)
-    x = camera.rays[..., 0] * valid
-    y = camera.rays[..., 1] * valid
-    out = np.empty((*camera.shape, 10))
-    for k, term in enumerate((valid, x, y, x * x, x * y, y * y, q, x * q, y * q, q * q)):
-        out[..., k] = term
-    return out
-
-
-def _box(values: Float64, radius: int) -> Float64:
-    """Sum over a (2 radius + 1)^2 window along the first two axes, zero outside the image."""
-    for axis in (0, 1):
-        pad = [(0, 0)] * values.ndim
-        pad[axis] = (radius + 1, radius)
-        total = np.cumsum(np.pad(values, pad), axis=axis)
-        size = values.shape[axis]
-        # Differences along one axis at a time: those of a two-dimensional integral image would cost digits.
-        values = np.take(total, range(2 * radius + 1, 2 * radius + 1 + size), axis) - np.take(
-            total, range(size), axis
-        )
-    return values
-
-
-def _fit(sums: Float64) -> tuple[Float64, Float64]:
-    """Fit planes to accumulated moments (..., 10).
-
-    Returns camera-facing unit normals (..., 3), NaN where they are not determined, and the residual standard deviation of
-    inverse depth (...).
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        n = sums[..., 0]
-        _, x, y, xx, xy, yy, q, xq, yq, qq = np.moveaxis(sums / n[..., None], -1, 0)
-        cxx, cxy, cyy, cxq, cyq = xx - x * x, xy - x * y, yy - y * y, xq - x * q, yq - y * q
-        det = cxx * cyy - cxy * cxy
-        mx, my = (cyy * cxq - cxy * cyq) / det, (cxx * cyq - cxy * cxq) / det
-        m = np.stack([mx, my, q - mx * x - my * y], axis=-1)
-        residual = np.sqrt(np.maximum(qq - q * q - mx * cxq - my * cyq, 0) * n / np.maximum(n - 3, 1))
-        normals: Float64 = -m / np.linalg.norm(m, axis=-1, keepdims=True)
-        normals[~((n > 2.5) & (det > _MIN_SPREAD * (cxx + cyy) ** 2))] = np.nan
-    return normals, residual
-
-
-def _facing(normals: Float64, rays: Float64, depth: NDArray[np.floating]) -> Float64:
-    """Drop normals without depth, and those that a fit across an edge turned away from the camera (n . r >= 0)."""
-    away = np.einsum("...c,...c->...", normals, rays) >= 0
-    normals[away | ~np.isfinite(depth)] = np.nan
-    return normals
-
-
 def normals_from_depth(depth: NDArray[np.floating], camera: Camera, radius: int = 4) -> Float64:
     """Fit a plane to each pixel's window.
 
@@ -105,7 +51,40 @@ def normals_from_depth(depth: NDArray[np.floating], camera: Camera, radius: int 
     DataError
         When depth is not of the camera's shape.
     """
-    return _facing(_fit(_box(_moments(depth, camera), radius))[0], camera.rays, depth)
+    _expect(depth, camera)
+    valid = np.isfinite(depth) & (depth > 0)
+    q = np.divide(1.0, depth, out=np.zeros(camera.shape), where=valid, dtype=np.float64)
+    x, y = camera.rays[..., 0] * valid, camera.rays[..., 1] * valid
+    sums = np.stack(
+        [_box(term, radius) for term in (valid * 1.0, x, y, x * x, x * y, y * y, q, x * q, y * q)]
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        n = sums[0]
+        _, x, y, xx, xy, yy, q, xq, yq = sums / n
+        cxx, cxy, cyy, cxq, cyq = xx - x * x, xy - x * y, yy - y * y, xq - x * q, yq - y * q
+        det = cxx * cyy - cxy * cxy
+        mx, my = (cyy * cxq - cxy * cyq) / det, (cxx * cyq - cxy * cxq) / det
+        m = np.stack([mx, my, q - mx * x - my * y], axis=-1)
+        normals: Float64 = -m / np.linalg.norm(m, axis=-1, keepdims=True)
+        away = np.einsum("...c,...c->...", normals, camera.rays) >= 0  # as a fit across an edge may turn it
+    good = (n > 2.5) & (det > _MIN_SPREAD * (cxx + cyy) ** 2) & ~away & np.isfinite(depth)
+    normals[~good] = np.nan
+    return normals
+
+
+def _expect(depth: NDArray[np.floating], camera: Camera) -> None:
+    if depth.shape != camera.shape:
+        raise DataError(f"normals: expected depth of shape {camera.shape}, got {depth.shape}")
+
+
+def _box(values: Float64, radius: int) -> Float64:
+    """Sum an image over a (2 radius + 1)^2 window, zero outside it."""
+    size = 2 * radius + 1
+    # Differences along one axis at a time: those of a two-dimensional integral image would cost digits.
+    for _ in range(2):
+        total = np.cumsum(np.pad(values, ((radius + 1, radius), (0, 0))), axis=0)
+        values = (total[size:] - total[:-size]).T
+    return values
 
 
 class PlaneField:
@@ -114,22 +93,16 @@ class PlaneField:
     Windows of several sizes are fitted at each place, and the largest is taken whose residual is what noise leaves in such
     windows (their median); beside creases that is a small one. The image's moments are summed once.
 
-    Parameters
-    ----------
-    depth
-        (H, W) z in metres; NaN: none.
-    camera
-        Intrinsics of the image.
+    ``depth`` (H, W) is z in metres, NaN: none; ``camera`` holds the intrinsics of the image.
     """
 
     def __init__(self, depth: NDArray[np.floating], camera: Camera) -> None:
-        if depth.shape != camera.shape:
-            raise DataError(f"normals: expected depth of shape {camera.shape}, got {depth.shape}")
+        _expect(depth, camera)
         self._camera = camera.pinhole("plane field")
         self._sums = _table(depth, camera.rays[0, :, 0].copy(), camera.rays[:, 0, 1].copy())
 
     def at(self, pixels: Float64, radii: Sequence[int] = RADII) -> tuple[Float64, Float64]:
-        """Planes at pixel coordinates.
+        """Fit planes at pixel coordinates.
 
         Parameters
         ----------
@@ -152,7 +125,8 @@ class PlaneField:
         some = np.ascontiguousarray(some[:: max(1, len(some) // TYPICAL)])
         found = np.empty((len(some), len(radii)))
         _residuals(self._sums, some, cells, _MIN_SPREAD, found)
-        limits = TOLERANCE * np.array([_typical(found[:, k]) for k in range(len(radii))])
+        fits = [column[np.isfinite(column)] for column in found.T]
+        limits = TOLERANCE * np.array([np.median(fit) if len(fit) else np.nan for fit in fits])
         chosen, residual = np.empty((len(pixels), 3)), np.empty(len(pixels))
         eye = self._camera
         rays = (pixels - [eye.cx, eye.cy]) / [eye.fx, eye.fy]
@@ -182,27 +156,14 @@ class PlaneField:
         """
         planes, residuals = self.at(pixels.reshape(-1, 2))
         depth, normals = depth.copy(), normals.copy()
-        _onto(
-            planes,
-            residuals,
-            T_camera_own,
-            camera.rays.reshape(-1, 3),
-            WITHIN,
-            depth.reshape(-1),
-            normals.reshape(-1, 3),
-        )
+        hits = depth.reshape(-1), normals.reshape(-1, 3)
+        _onto(planes, residuals, T_camera_own, camera.rays.reshape(-1, 3), WITHIN, *hits)
         return depth, normals
-
-
-def _typical(residuals: Float64) -> float:
-    """Median of those that there are; NaN for none."""
-    fitted = residuals[np.isfinite(residuals)]
-    return float(np.median(fitted)) if len(fitted) else np.nan
 
 
 @compiled
 def _table(depth: NDArray[np.floating], x: Float64, y: Float64) -> Float64:
-    """Sum the terms of :func:`_moments` over all cells above and to the left: (rows + 1, columns + 1, 10); NaN counts nothing."""
+    """Sum 1, x, y, xx, xy, yy, q, xq, yq, qq with q = 1 / depth over all cells above and to the left; NaN counts nothing."""
     height, width = depth.shape
     rows, columns = (height + CELL - 1) // CELL, (width + CELL - 1) // CELL
     out = np.zeros((rows + 1, columns + 1, 10))

@@ -1,13 +1,13 @@
 """Project the stereo surface onto the ToF image plane.
 
-The organised stereo points are a triangulated sheet. Where two neighbours are further apart in depth than a surface can be,
-the sheet is cut; the cut quads become a *skirt*. A row's hole is bridged by a straight line: from a foreground edge to
-the first background point that both eyes see, that line is the right eye's line of sight, so the skirt bounds the space that
-the stereo camera does not know. A ToF ray that crosses the skirt before it hits the sheet went through unknown space, and so
-did one that was outside the eyes' common view at a depth at which there are things.
+The organised stereo points are a triangulated sheet. It is cut where two neighbours are further apart in depth than a
+surface can be; the cut quads become a *skirt*. A row's hole is bridged by a straight line. From a foreground edge to the first
+background point that both eyes see, that line is the right eye's line of sight. So the skirt bounds the space that the stereo
+camera does not know. A ToF ray that crosses the skirt before it hits the sheet went through unknown space, and so did one
+that was outside the eyes' common view at a depth at which there are things.
 
-Rays through pixel centres are intersected exactly with every triangle they can meet; nothing is splatted, so background
-never leaks through a foreground that is sparser than the image.
+Rays through pixel centres are intersected exactly with every triangle they can meet. Nothing is splatted: background never
+leaks through a foreground that is sparser than the image.
 """
 
 from __future__ import annotations
@@ -61,12 +61,6 @@ class Projection:
     edge: Bool
 
 
-def _axes(camera: Camera) -> tuple[Float64, Float64]:
-    """Rays of a camera's columns and rows."""
-    rays = camera.pinhole("stereo depth").rays
-    return rays[0, :, 0].copy(), rays[:, 0, 1].copy()
-
-
 def triangulate(depth: NDArray[np.floating], camera: Camera) -> Sheet:
     """Turn a stereo depth image into a sheet with cuts.
 
@@ -89,26 +83,21 @@ def triangulate(depth: NDArray[np.floating], camera: Camera) -> Sheet:
 
 
 def _dilate(mask: Bool, radius: int) -> Bool:
-    padded = np.pad(mask, radius)
-    height, width = mask.shape
-    out = np.zeros_like(mask)
-    for dv in range(2 * radius + 1):
-        for du in range(2 * radius + 1):
-            out |= padded[dv : dv + height, du : du + width]
+    from scipy.ndimage import binary_dilation
+
+    out: Bool = binary_dilation(mask, np.ones((2 * radius + 1, 2 * radius + 1), dtype=bool))
     return out
 
 
 def _jumps(depth: Float64, camera: Camera) -> Bool:
-    """Pixels beside a step in depth that no surface at less than 80 degrees makes."""
+    """Mark pixels beside a step in depth that no surface at less than 80 degrees makes."""
     limit = STEEPEST / min(camera.fx, camera.fy) * depth
     out = np.zeros(camera.shape, dtype=bool)
     with np.errstate(invalid="ignore"):
         across = np.abs(np.diff(depth, axis=1)) > np.fmin(limit[:, 1:], limit[:, :-1])
         down = np.abs(np.diff(depth, axis=0)) > np.fmin(limit[1:], limit[:-1])
-    out[:, 1:] |= across
-    out[:, :-1] |= across
-    out[1:] |= down
-    out[:-1] |= down
+    for part, step in ((out[:, 1:], across), (out[:, :-1], across), (out[1:], down), (out[:-1], down)):
+        np.logical_or(part, step, out=part)
     return out
 
 
@@ -148,12 +137,8 @@ def project(
 
     Parameters
     ----------
-    sheet
-        From :func:`triangulate`.
-    stereo
-        Intrinsics of the sheet's grid.
-    T_tof_stereo
-        (4, 4) stereo frame to ToF frame.
+    sheet, stereo, T_tof_stereo
+        From :func:`triangulate`, with the intrinsics of its grid, and (4, 4) its frame to the ToF frame.
     camera
         Intrinsics on the ToF plane, any size.
     edge_pixels
@@ -164,23 +149,21 @@ def project(
     """
     if camera.distortion:
         return _through_lens(sheet, stereo, T_tof_stereo, camera, edge_pixels, far)
-    eye = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    x, y = _axes(stereo)
+    eye, grid = (np.array([c.fx, c.fy, c.cx, c.cy]) for c in (camera, stereo.pinhole("stereo depth")))
+    x, y = stereo.rays[0, :, 0].copy(), stereo.rays[:, 0, 1].copy()
     found = np.full((camera.height * camera.width, 6), np.inf)
     skirt = np.full(camera.height * camera.width, np.inf)
     _render(sheet.depth, sheet.surface, x, y, T_tof_stereo, far, eye, camera.shape, found, skirt)
     found[~np.isfinite(found[:, 0])] = np.nan
     image = found.reshape(*camera.shape, 6)
-    depth = np.ascontiguousarray(image[..., 0])
-    border = np.zeros(camera.shape, dtype=bool)
-    _borders(sheet.depth, sheet.vertex, sheet.surface, x, y, T_tof_stereo, far, eye, depth, border)
+    depth, hidden = np.ascontiguousarray(image[..., 0]), skirt.reshape(camera.shape)
+    border = _borders(sheet, x, y, T_tof_stereo, far, camera, depth)
     edge = _dilate(np.isnan(depth) | border | _jumps(depth, camera), edge_pixels)
     # Those beside it hit measured surface: marking them too would cost small far objects half of their pixels.
-    _invented(sheet.doubtful, image[..., 1:3], edge)
-    hidden = skirt.reshape(camera.shape)
+    edge |= _interpolated(sheet.doubtful, image[..., 1:3])
     aside = np.zeros(camera.shape, dtype=bool)
     if np.isfinite(depth).any():
-        near, grid = NEARER * float(np.nanmin(depth)), np.array([stereo.fx, stereo.fy, stereo.cx, stereo.cy])
+        near = NEARER * float(np.nanmin(depth))
         _unseen(sheet.depth, grid, invert(T_tof_stereo), eye, near, depth, STEPS, aside)
     return Projection(
         depth=depth,
@@ -189,6 +172,39 @@ def project(
         occluded=aside | (np.isfinite(hidden) & ~(hidden > depth * (1 - HIDES) - HIDES)),
         edge=edge,
     )
+
+
+def _all_corners(of: Bool) -> tuple[Bool, Bool, Bool, Bool]:
+    return of[:-1, :-1], of[:-1, 1:], of[1:, :-1], of[1:, 1:]
+
+
+def _borders(
+    sheet: Sheet, x: Float64, y: Float64, T: Float64, far: float, camera: Camera, depth: Float64
+) -> Bool:
+    """Mark the pixels where the sheet visibly ends or is cut: a vertex there has a quad about it that is no surface."""
+    inner = np.zeros_like(sheet.vertex)
+    inner[1:-1, 1:-1] = np.logical_and.reduce(_all_corners(sheet.surface))
+    v, u = np.nonzero(sheet.vertex & ~inner)
+    p, q, r = (sheet.depth[v, u] * (T[k, 0] * x[u] + T[k, 1] * y[v] + T[k, 2]) + T[k, 3] for k in range(3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.where((r > 0) & (r < far), r, np.nan)
+        at = np.rint([camera.fy * q / z + camera.cy, camera.fx * p / z + camera.cx])
+        inside = ((at >= 0) & (at < np.array(camera.shape)[:, None])).all(axis=0)
+    row, column = at[:, inside].astype(np.intp)
+    seen = ~(r[inside] > depth[row, column] * 1.01 + 0.005)
+    mark = np.zeros(camera.shape, dtype=bool)
+    mark[row[seen], column[seen]] = True
+    return mark
+
+
+def _interpolated(doubtful: Bool, pixels: Float64) -> Bool:
+    """Mark the pixels whose hit ``pixels`` (H, W, 2) lies on a quad with a doubtful corner."""
+    quads = np.logical_or.reduce(_all_corners(doubtful))
+    hit = np.isfinite(pixels[..., 0])
+    at = np.where(hit[..., None], pixels, 0).astype(np.intp)
+    column, row = (np.minimum(at[..., k], quads.shape[1 - k] - 1) for k in (0, 1))
+    out: Bool = hit & quads[row, column]
+    return out
 
 
 @compiled
@@ -319,22 +335,11 @@ def _render(
     z: Float64, surface: Bool, x: Float64, y: Float64, pose: Float64, far: float,
     eye: Float64, size: tuple[int, int], out: Float64, skirt: Float64,
 ) -> None:  # fmt: skip
-    """Nearest hits of all pixels' rays with a sheet and with its skirt.
+    """Find the nearest hits of all pixels' rays with a sheet ``z``, ``surface`` and with its skirt.
 
-    Parameters
-    ----------
-    z, surface
-        (SH, SW), (SH-1, SW-1) the sheet.
-    x, y
-        (SW,), (SH,) rays of the stereo grid.
-    pose, far
-        (4, 4) stereo to eye; depth limit in the eye's frame.
-    eye, size
-        fx, fy, cx, cy; height and width of the eye's image.
-    out
-        (H W, 6) depth (start with infinity), place on the grid (u, v), normal.
-    skirt
-        (H W,) depth, start with infinity.
+    ``x`` and ``y`` are rays of the grid, ``pose`` maps its frame to that of the ``eye`` (fx, fy, cx, cy), whose image has
+    ``size`` (H, W). ``out`` (H W, 6) receives depth, place on the grid (u, v), normal, ``skirt`` (H W,) depth; both start with
+    infinity.
     """
     height, width = size
     p, q = np.empty((len(x), 3)), np.empty((len(x), 3))
@@ -353,43 +358,6 @@ def _render(
                 corners = (p[u], p[u + 1], q[u], q[u + 1])
                 _trace(corners, box, (v, u), surface[v, u], eye, width, out, skirt)
         p, q, s, t = q, p, t, s
-
-
-@compiled
-def _borders(
-    z: Float64, vertex: Bool, surface: Bool, x: Float64, y: Float64, pose: Float64, far: float,
-    eye: Float64, depth: Float64, mark: Bool,
-) -> None:  # fmt: skip
-    """Mark the pixels (H, W) where the sheet visibly ends or is cut."""
-    height, width = mark.shape
-    rows, columns = surface.shape
-    p, s = np.empty((1, 3)), np.empty((1, 2))
-    for v in range(rows + 1):
-        for u in range(columns + 1):
-            inner = 0 < v < rows and 0 < u < columns
-            inner = (
-                inner and surface[v, u] and surface[v, u - 1] and surface[v - 1, u] and surface[v - 1, u - 1]
-            )
-            if inner or not vertex[v, u]:
-                continue
-            _points_of_row(z[v, u : u + 1], x[u : u + 1], y[v], pose, far, eye, p, s)
-            if not (-1 < s[0, 0] < width and -1 < s[0, 1] < height):
-                continue
-            pu, pv = int(np.rint(s[0, 0])), int(np.rint(s[0, 1]))
-            if 0 <= pu < width and 0 <= pv < height and not (p[0, 2] > depth[pv, pu] * 1.01 + 0.005):
-                mark[pv, pu] = True
-
-
-@compiled
-def _invented(doubtful: Bool, pixels: Float64, mark: Bool) -> None:
-    """Mark the pixels (H, W) whose hit ``pixels`` (H, W, 2) lies on a quad with a doubtful corner."""
-    rows, columns = doubtful.shape
-    for pv in range(mark.shape[0]):
-        for pu in range(mark.shape[1]):
-            if not mark[pv, pu] and np.isfinite(pixels[pv, pu, 0]):
-                u, v = min(int(pixels[pv, pu, 0]), columns - 2), min(int(pixels[pv, pu, 1]), rows - 2)
-                above = doubtful[v, u] or doubtful[v, u + 1]
-                mark[pv, pu] = above or doubtful[v + 1, u] or doubtful[v + 1, u + 1]
 
 
 @compiled

@@ -16,8 +16,8 @@ from tofcapture.devices.clearance import stage_of
 from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.sim import VERSION
-from tofcapture.devices.sim.arm import SimArm, SimClock, shared_clock
 from tofcapture.devices.sim.config import read_constants
+from tofcapture.devices.sim.drivers import SimArm, SimClock, shared_clock
 from tofcapture.devices.sim.scenes import generator
 from tofcapture.devices.sim.world import SimWorld
 from tofcapture.devices.station import read_station

@@ -1,4 +1,4 @@
-"""The simulated devices: plain classes over the shared world."""
+"""The simulated devices, over the world that they share: an arm, two cameras, and who changes the scene."""
 
 from __future__ import annotations
 
@@ -9,13 +9,46 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from tofcapture.devices import Device, Operator, StereoDevice, TofCamera
-from tofcapture.errors import ConfigError
-from tofcapture.frames import StereoFrame, StereoInfo, TofBurst, TofInfo, Truth
+from tofcapture.devices import Arm, Device, Operator, StereoDevice, TofCamera
+from tofcapture.devices.kinematics import HOME, arm_model, check_joints, forward
+from tofcapture.devices.registry import check_keys
+from tofcapture.devices.sim import hashed_generator
+from tofcapture.devices.sim.world import SimWorld, shared_world
+from tofcapture.errors import ConfigError, DeviceError
+from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth
+from tofcapture.poses import Float64, exp
 
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
-    from tofcapture.devices.sim.world import SimWorld
+
+# ISO 9283 pose repeatability of the UR10e is 0.05 mm; this is one standard deviation per axis.
+REPEATABILITY = np.repeat([0.02e-3, np.radians(0.001)], 3)  # m, rad
+_SETTLE = 0.5  # s; ringing after a stop, capture.md 7
+
+
+class SimClock:
+    """The simulated station's monotonic clock, int64 ns; every reading moves it on by half a second, longer than a burst.
+
+    It starts anew at every pose, as if each move came from home: a view taken again then carries the same times.
+    """
+
+    def __init__(self) -> None:
+        self._now = 0
+
+    def arrive(self, seconds: float) -> None:
+        """Set the clock to the end of a move from home."""
+        self._now = round(seconds * 1e9)
+
+    def __call__(self) -> int:
+        """Read the clock."""
+        self._now += 500_000_000
+        return self._now
+
+
+def shared_clock(context: StationContext) -> SimClock:
+    """Return the clock that all simulated devices of one station share."""
+    clock: SimClock = context.shared.setdefault("sim_clock", SimClock())
+    return clock
 
 
 class _InWorld(Device):
@@ -27,31 +60,81 @@ class _InWorld(Device):
 
     @property
     def _world(self) -> SimWorld:
-        from tofcapture.devices.sim.world import shared_world
-
         return shared_world(self._context)
 
-    @property
-    def _here(self) -> SimWorld:
-        """The world at the arm's pose: an arm that is not simulated is asked for it, the simulated one has said it."""
+    def _present(self) -> tuple[SimWorld, Callable[[], int]]:
+        """Return the world at the arm's pose, and a clock: a real arm is asked, the simulated one has said where it is."""
         arm = self._context.shared.get("arm")
-        if arm is not None and not arm.simulated:
-            state = arm.state()
-            self._world.set_pose(state.T_base_flange, state.joints.round(5).tobytes())
-        return self._world
-
-    @property
-    def _clock(self) -> Callable[[], int]:
-        from tofcapture.devices.sim.arm import shared_clock
-
-        arm = self._context.shared.get("arm")
-        if arm is not None and not arm.simulated:
-            return time.monotonic_ns
-        return shared_clock(self._context)
+        if arm is None or arm.simulated:
+            return self._world, shared_clock(self._context)
+        state = arm.state()
+        self._world.set_pose(state.T_base_flange, state.joints.round(5).tobytes())
+        return self._world, time.monotonic_ns
 
     def __enter__(self) -> Self:
         _ = self._world
         return self
+
+
+class SimArm(_InWorld, Arm):
+    """Simulated six-axis arm: a real arm's kinematics, its speed, its limits and its repeatability error.
+
+    Parameters
+    ----------
+    table
+        ``model``: ``ur10e`` or ``ur5e``.
+    context
+        The station; holds the simulated world.
+    """
+
+    simulated = True  # moves nothing that could hurt anyone
+
+    def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
+        super().__init__(table, context)
+        check_keys(table, ("model",), "[arm]")
+        self._model = arm_model(str(table.get("model", "ur10e")))
+        self._joints: Float64 | None = None
+
+    def __enter__(self) -> Self:
+        self._go(HOME)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._joints = None
+
+    def describe(self) -> ArmInfo:
+        """Say what this arm is."""
+        return ArmInfo(model=self._model.name, serial="sim-arm")
+
+    def state(self) -> ArmState:
+        """Report the commanded joints; the repeatability error is what no arm can know of itself."""
+        if self._joints is None:
+            raise DeviceError("the simulated arm is not open", hint="use the station as a context manager")
+        T_base_flange = forward(self._model, self._joints) @ self._world.faults.offset
+        return ArmState(self._joints.copy(), T_base_flange, shared_clock(self._context)())
+
+    def move_to(self, joints: Float64) -> ArmState:
+        """Move along the joints at the model's speed, settle, and report; takes no time of ours.
+
+        Raises
+        ------
+        MotionRefused
+            The goal is not six finite angles within the limits.
+        """
+        goal = check_joints(self._model, joints)
+        self._world.faults.before_move()
+        self._go(goal)
+        return self.state()
+
+    def _go(self, goal: Float64) -> None:
+        world, key = self._world, np.round(goal, 9).tobytes()
+        error = hashed_generator(b"arm" + str(world.seed).encode() + key).standard_normal(6) * REPEATABILITY
+        world.set_pose(forward(self._model, goal) @ exp(error), key)
+        shared_clock(self._context).arrive(float(np.abs(goal - HOME).max()) / self._model.speed + _SETTLE)
+        self._joints = goal
+
+    def stop(self) -> None:
+        """Do nothing: a simulated move is over when it returns."""
 
 
 class SimTof(_InWorld, TofCamera):
@@ -66,7 +149,8 @@ class SimTof(_InWorld, TofCamera):
         if frames < 1:
             raise ConfigError(f"burst: expected at least 1 frame, got {frames}")
         self._world.faults.before_burst()
-        return self._here.tof(frames, self._clock)
+        world, clock = self._present()
+        return world.tof(frames, clock)
 
 
 class SimStereo(_InWorld, StereoDevice):
@@ -79,7 +163,8 @@ class SimStereo(_InWorld, StereoDevice):
     def capture(self) -> StereoFrame:
         """Take one point map at the arm's present pose."""
         empty = self._world.faults.before_points()
-        frame = self._here.stereo(self._clock)
+        world, clock = self._present()
+        frame = world.stereo(clock)
         return replace(frame, points=np.full_like(frame.points, np.nan)) if empty else frame
 
 
@@ -92,13 +177,7 @@ class SimOperator(_InWorld, Operator):
 
     def truth(self) -> Truth | None:
         """Return what is exactly true of the present view."""
-        return self._here.truth()
+        return self._present()[0].truth()
 
 
-def _arm(table: Mapping[str, Any], context: StationContext) -> object:
-    from tofcapture.devices.sim.arm import SimArm
-
-    return SimArm(table, context)
-
-
-DRIVERS = {"arm": _arm, "tof": SimTof, "stereo": SimStereo, "operator": SimOperator}
+DRIVERS = {"arm": SimArm, "tof": SimTof, "stereo": SimStereo, "operator": SimOperator}
