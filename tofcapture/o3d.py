@@ -46,6 +46,5 @@ def load_open3d() -> ModuleType:
         return importlib.import_module("open3d")
     except (ImportError, OSError) as err:
         raise ConfigError(
-            f"open3d is needed here and does not load: {err}",
-            hint="pip install 'tofcapture[capture]'",
+            f"open3d is needed here and does not load: {err}", hint="pip install 'tofcapture[capture]'"
         ) from err

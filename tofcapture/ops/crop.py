@@ -71,16 +71,12 @@ def _candidates(points: Float64, rng: np.random.Generator, trials: int) -> tuple
 def dominant_plane(
     points: Float64, rng: np.random.Generator, up: Float64 | None = None
 ) -> tuple[Float64, float, float] | None:
-    """Find the plane that most points (N, 3) lie on.
-
-    RANSAC over random triples, then three rounds of least squares over the inliers.
+    """Find the plane that most points lie on: RANSAC over random triples, then three rounds of least squares over the inliers.
 
     Parameters
     ----------
-    points
-        (N, 3) finite, metres.
-    rng
-        Draws the triples; the same generator state gives the same plane.
+    points, rng
+        (N, 3) finite, metres; what draws the triples.
     up
         (3,) unit; only planes within 10 degrees of level count. ``None``: any.
 
@@ -125,11 +121,9 @@ def table_plane(
 ) -> tuple[Float64, float, float] | None:
     """Find the plane that things stand on.
 
-    It is the dominant level plane, or the lowest parallel one within an object's height below it. Without a dominant level
-    plane (an arm on a wall: its base is not upright) any dominant plane is taken that is more than 30 degrees from level; one
-    in between is an inclined object that fills the view.
-
-    Parameters and result as for :func:`dominant_plane`.
+    It is the dominant level plane, or the lowest parallel one within an object's height below it. Without a level one (an
+    arm on a wall) any dominant plane is taken that is more than 30 degrees from level; one in between is an inclined object
+    that fills the view. Arguments and result are those of :func:`dominant_plane`.
     """
     found = dominant_plane(points, rng, up)
     if found is None:
@@ -156,24 +150,16 @@ def find_crop(
 ) -> Crop:
     """Find the table and the region above it that holds the scene's object.
 
+    Without a dominant plane, or with a radius of 100 m or more, everything within ``far`` is kept.
+
     Parameters
     ----------
     points
         (..., 3), ToF frame, metres; NaN: not measured.
-    up
-        (3,) unit, ToF frame: z of the arm's base. Its sign does not matter, an arm may hang.
-    rng
-        For the plane search.
-    radius
-        Largest distance of the object from the point the camera looks at, along the table, metres; from 100 m on the scene
-        is all that there is: no table is looked for.
-    far
-        Largest depth, metres.
-
-    Returns
-    -------
-    Crop
-        Without a dominant plane, or with a radius of 100 m or more, it keeps everything within ``far``.
+    up, rng
+        (3,) unit, ToF frame: z of the arm's base, of any sign as an arm may hang; for the plane search.
+    radius, far
+        Largest distance of the object from the point the camera looks at, along the table; largest depth; metres.
     """
     everything = Crop(np.full(3, np.nan), np.nan, np.zeros(3), np.inf, 0.0, far)
     if radius >= WHOLE:
@@ -192,18 +178,9 @@ def find_crop(
 def refine_clearance(crop: Crop, points: NDArray[np.floating]) -> Crop:
     """Lower a crop's clearance to what smoothed points allow: foreground begins where the table's own scatter ends.
 
-    Parameters
-    ----------
-    crop
-        From :func:`find_crop`, its clearance made for single measured points.
-    points
-        (..., 3) of the smoothed surface, ToF frame, metres; NaN: none.
-
-    Returns
-    -------
-    Crop
-        With a clearance of four standard deviations (1.48 MAD) of the points that the crop takes for table: at least a
-        quarter of a millimetre or, from close by, twelve of them, and never more than before.
+    :func:`find_crop` made it for single measured points. For those of the smoothed surface, ``points`` (..., 3), ToF frame, it
+    becomes four standard deviations (1.48 MAD) of what the crop takes for table: at least a quarter of a millimetre or,
+    from close by, twelve of them, and never more than before.
     """
     if not np.isfinite(crop.offset):
         return crop

@@ -90,7 +90,7 @@ def _box(values: Float64, radius: int) -> Float64:
 class PlaneField:
     """Planes through a depth image wherever they are asked for, in windows as large as the surface is flat.
 
-    Windows of several sizes are fitted at each place, and the largest is taken whose residual is what noise leaves in such
+    Windows of several sizes are fitted at each place. The largest is taken whose residual is what noise leaves in such
     windows (their median); beside creases that is a small one. The image's moments are summed once.
 
     ``depth`` (H, W) is z in metres, NaN: none; ``camera`` holds the intrinsics of the image.
@@ -104,12 +104,8 @@ class PlaneField:
     def at(self, pixels: Float64, radii: Sequence[int] = RADII) -> tuple[Float64, Float64]:
         """Fit planes at pixel coordinates.
 
-        Parameters
-        ----------
-        pixels
-            (n, 2) as (u, v), inside the image; NaN gives NaN.
-        radii
-            Of the windows to choose from, ascending, pixels; windows are whole cells of 2 x 2 pixels.
+        ``pixels`` are (n, 2) as (u, v), inside the image; NaN gives NaN. ``radii`` are those of the windows to choose from,
+        ascending, pixels; windows are whole cells of 2 x 2 pixels.
 
         Returns
         -------
@@ -141,18 +137,9 @@ class PlaneField:
         A ray's triangle is as noisy as three points. Where the plane through the window about it is as good as planes here
         are, and passes the triangle within the points' noise, the ray is intersected with that plane.
 
-        Parameters
-        ----------
-        depth, normals
-            (H, W), (H, W, 3) of the hits, that camera's frame, metres.
-        pixels
-            (H, W, 2) where this field's image has the hits; NaN: none.
-        camera, T_camera_own
-            That camera, and (4, 4) this field's frame to its frame.
-
-        Returns
-        -------
-        Depth, and the normals of the best planes that face the camera, a triangle's own where none does.
+        ``depth`` (H, W) and ``normals`` (H, W, 3) of the hits are in that camera's frame, to which ``T_camera_own`` maps
+        this field's. ``pixels`` (H, W, 2) is where this field's image has the hits; NaN: none. Returned are depth, and the
+        normals of the best planes that face the camera, a triangle's own where none does.
         """
         planes, residuals = self.at(pixels.reshape(-1, 2))
         depth, normals = depth.copy(), normals.copy()

@@ -62,14 +62,9 @@ class Projection:
 
 
 def triangulate(depth: NDArray[np.floating], camera: Camera) -> Sheet:
-    """Turn a stereo depth image into a sheet with cuts.
+    """Turn a stereo depth image (SH, SW), z in metres, NaN: none, into a sheet with cuts.
 
-    ``depth`` is (SH, SW) z in the stereo frame in metres, NaN: none; ``camera`` holds the intrinsics of that grid.
-
-    Raises
-    ------
-    DataError
-        When depth is not of the camera's shape.
+    ``camera`` holds the intrinsics of that grid; :class:`DataError` when depth is not of its shape.
     """
     if depth.shape != camera.shape:
         raise DataError(f"triangulate: expected depth of shape {camera.shape}, got {depth.shape}")
@@ -305,7 +300,7 @@ def _trace(
     """Intersect the rays of the pixels in a box with both triangles of a quad.
 
     For a triangle abc and a ray r the numbers ``r . (b x c)``, ``r . (c x a)``, ``r . (a x b)`` have one sign exactly when
-    the ray goes through it, are its barycentric weights, and ``det(a, b, c)`` over their sum is the depth. Neighbouring
+    the ray goes through it. They are its barycentric weights, and ``det(a, b, c)`` over their sum is the depth. Neighbouring
     triangles compute the same numbers for their common edge: no ray slips between them.
     """
     a, b, c, d = corners

@@ -18,16 +18,7 @@ from tofcapture.devices.sim.scene import SceneObject
 from tofcapture.devices.sim.shapes import FAMILIES, ball, board
 from tofcapture.errors import ConfigError
 from tofcapture.frames import CALIBRATION
-from tofcapture.meshes import (
-    SUFFIXES,
-    Mesh,
-    cuboid,
-    cylinder,
-    extrude,
-    move,
-    read_mesh,
-    settle,
-)
+from tofcapture.meshes import SUFFIXES, Mesh, cuboid, cylinder, extrude, move, read_mesh, settle
 from tofcapture.poses import Float64, rotation_exp, transform
 
 TABLE_CENTRE: Float64 = np.array([0.70, 0.0, -0.50])  # m, base frame, on the table top

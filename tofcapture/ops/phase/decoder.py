@@ -54,10 +54,9 @@ class Decoder:
     ----------
     info
         Channels, intrinsics, light source, saturation and range errors.
-    noise
-        Of one tap; decides which pixels are of low confidence.
-    min_amplitude
-        Pixels whose weaker amplitude is not above it have no depth; raw units.
+    noise, min_amplitude
+        Of one tap: decides which pixels are of low confidence. Those whose weaker amplitude is not above the least, raw units,
+        have no depth.
 
     Raises
     ------
@@ -94,13 +93,7 @@ class Decoder:
         self._darkness = np.zeros((2, size if self._dark.any() else 0), np.float32)
 
     def __call__(self, raw: NDArray[Any], celsius: float = float("nan")) -> DepthMaps:
-        """Decode one frame (K, H, W) of taps, any real dtype; ``celsius`` NaN: unknown.
-
-        Raises
-        ------
-        DataError
-            When ``raw`` is of another shape.
-        """
+        """Decode one frame (K, H, W) of taps, any real dtype; :class:`DataError` when it is of another shape."""
         self._expect(raw.shape)
         return self._decode(raw, celsius, 1, raw.max(axis=0))
 
@@ -152,14 +145,9 @@ class Decoder:
         return DepthMaps(image, confidence.reshape(camera.shape), bits)
 
     def _phases(
-        self,
-        raw: NDArray[Any],
-        frames: int,
-        confidence: Float32,
-        flags: NDArray[np.uint8],
-        bad: NDArray[np.bool_],
-        iq: Float32 | None,
-    ) -> tuple[Float32, Float32]:
+        self, raw: NDArray[Any], frames: int, confidence: Float32, flags: NDArray[np.uint8],
+        bad: NDArray[np.bool_], iq: Float32 | None,
+    ) -> tuple[Float32, Float32]:  # fmt: skip
         """Compute phases of both frequencies in turns, [0, 1), and scratch; amplitude and what it decides on the way."""
         n = raw.shape[1]
         real, imag, size, work = self._buffers[0][..., :n]
@@ -184,13 +172,9 @@ class Decoder:
         return size, work
 
     def _ranges(
-        self,
-        phases: tuple[Float32, Float32],
-        at: slice,
-        celsius: float,
-        flags: NDArray[np.uint8],
+        self, phases: tuple[Float32, Float32], at: slice, celsius: float, flags: NDArray[np.uint8],
         kept: Float32 | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Free ranges of their systematic errors, unwrap the high one, fuse both; the result lies in the low one."""
         (low, high), (gap, work) = phases
         indices = [index[: low.size] for index in self._indices]
@@ -227,17 +211,9 @@ def flying_pixels(
 ) -> NDArray[np.bool_]:
     """Find pixels that neither neighbour of a row, or neither of a column, supports.
 
-    A mixed pixel hangs between two surfaces (method.md 4.4): depth jumps on both of its sides by more than a surface at 80
-    degrees makes from one pixel to the next. Pixels beside holes are not flagged for them.
-
-    Parameters
-    ----------
-    depth
-        (H, W), metres; NaN: none.
-    camera
-        Gives the distance between neighbouring rays.
-    scratch
-        (2, H W) of depth's dtype, overwritten; ``None``: made here.
+    A mixed pixel hangs between two surfaces (method.md 4.4): depth (H, W) jumps on both of its sides by more than a surface at
+    80 degrees makes from one pixel to the next. Pixels beside holes (NaN) are not flagged for them. ``scratch`` (2, H W) of
+    depth's dtype is overwritten.
     """
     step_of, steep_of = np.empty((2, depth.size), depth.dtype) if scratch is None else scratch
     out = np.zeros(depth.shape, dtype=bool)

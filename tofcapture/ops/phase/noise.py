@@ -30,23 +30,14 @@ def photon_transfer(bursts: Iterable[NDArray[np.generic]], saturation: float) ->
     The shot noise of ``n`` electrons has the variance ``n``, so the slope is the raw units that an electron makes. What is
     left in the dark is the electronics', less the rounding to whole units. Taps are sorted by their mean into bins of equal
     number, which are weighted by what their variance is worth. Pixels noisier than all others of their brightness are left out.
+    Where brighter taps are not noisier there are infinite electrons per unit.
 
     Parameters
     ----------
     bursts
         Each (frames, ...) raw taps of at least two frames, raw units.
     saturation
-        Taps that reach it in any frame say nothing of noise.
-
-    Returns
-    -------
-    TapNoise
-        With infinite electrons per unit where brighter taps are not noisier.
-
-    Raises
-    ------
-    DataError
-        Too few taps that are not saturated.
+        Taps that reach it in any frame say nothing of noise; :class:`DataError` when too few others are left.
     """
     means, variances = [], []
     for burst in bursts:

@@ -29,19 +29,10 @@ def ambiguity(modulation_hz: float) -> float:
 def solution(
     modulation_hz: Sequence[float], phase_rad: Sequence[float], hz: float
 ) -> tuple[NDArray[np.int64], Float64]:
-    """Solve for the least-squares weights of one frequency.
+    """Solve for the channels (n,) of one frequency, and their least-squares weights (3, n).
 
-    Returns
-    -------
-    channels
-        (n,) that belong to the frequency.
-    weights
-        (3, n): times those taps they give ``B``, ``A cos phi`` and ``-A sin phi``.
-
-    Raises
-    ------
-    DataError
-        When the phases do not determine a phasor.
+    The weights times those taps give ``B``, ``A cos phi`` and ``-A sin phi``; :class:`DataError` when the phases do not
+    determine a phasor.
     """
     theta = np.asarray(phase_rad, dtype=np.float64)
     k = np.flatnonzero(np.asarray(modulation_hz, dtype=np.float64) == hz)
@@ -56,7 +47,7 @@ def solution(
 
 
 def phasors(raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequence[float]) -> Complex128:
-    """Fit the phasor of each frequency by least squares.
+    """Fit the phasor of each frequency by least squares: (..., F, H, W), ``A exp(i phi)``, frequencies ascending.
 
     Parameters
     ----------
@@ -64,10 +55,6 @@ def phasors(raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequen
         (..., K, H, W) taps, any real dtype, in any order of channels.
     modulation_hz, phase_rad
         (K,) frequency and demodulation phase of each channel.
-
-    Returns
-    -------
-    (..., F, H, W) complex128, ``A exp(i phi)``, frequencies ascending.
 
     Raises
     ------

@@ -14,35 +14,25 @@ from tofcapture.ops.phase.phasors import Complex128, Float64, ambiguity, frequen
 from tofcapture.ops.phase.unwrapping import centred, unwrap, unwrap_spatial
 from tofcapture.rig import RangeError, image_places, radius_px
 
-_STEPS = 20  # of the fixed point
-_SETTLED = 1e-8  # m
+_STEPS, _SETTLED = 20, 1e-8  # of the fixed point, m
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """What decoding yields, float64."""
+    """What decoding yields, float64; ranges are half the path from the illuminator over the surface to the camera."""
 
-    #: (H, W) distance from the ToF camera along the ray, metres; NaN where it cannot be decoded.
-    radial: Float64
-    #: (H, W) half the path from the illuminator over the surface to the camera by either frequency, before
-    #: fusion, metres. The low one is wrapped at its own ambiguity, the high one is unwrapped.
-    range_low: Float64
-    range_high: Float64
+    radial: Float64  #: (H, W) distance along the ray, metres; NaN where it cannot be decoded.
+    range_low: Float64  #: (H, W) by the low frequency alone, metres, wrapped at its own ambiguity.
+    range_high: Float64  #: (H, W) by the high frequency alone, metres, unwrapped.
     amplitude: Float64  #: (2, H, W), raw units; that of the high frequency is the confidence.
 
 
 def decode(
-    phasor: Complex128,
-    modulation_hz: Sequence[float],
-    camera: Camera,
-    illuminator: NDArray[np.floating],
-    range_errors: Sequence[RangeError] = (),
-    celsius: float = 45.0,
-    saturated: NDArray[np.bool_] | None = None,
-    min_amplitude: float = 0.0,
-    tap_sigma: float | None = None,
-) -> Decoded:
-    """Decode phasors (2, H, W), frequencies ascending, to distance.
+    phasor: Complex128, modulation_hz: Sequence[float], camera: Camera, illuminator: NDArray[np.floating],
+    range_errors: Sequence[RangeError] = (), celsius: float = 45.0, saturated: NDArray[np.bool_] | None = None,
+    min_amplitude: float = 0.0, tap_sigma: float | None = None,
+) -> Decoded:  # fmt: skip
+    """Decode phasors of two frequencies to distance.
 
     Range errors are taken off per frequency and the high one is unwrapped by the low one. Both are fused with weights
     proportional to f^2, the inverse variance at equal phase noise (method.md 4.3).
@@ -50,11 +40,9 @@ def decode(
     Parameters
     ----------
     phasor, modulation_hz
-        (2, H, W), and (K,) of the raw channels, which gives the two frequencies.
-    camera, illuminator
-        Intrinsics, light source (3,) in metres.
-    range_errors, celsius
-        Calibration and sensor temperature; a frequency without an error is taken as it is.
+        (2, H, W), frequencies ascending, and (K,) of the raw channels, which gives the two frequencies.
+    camera, illuminator, range_errors, celsius
+        Intrinsics, light source (3,) in metres, calibration, sensor temperature.
     saturated, min_amplitude
         Pixels (H, W) that become NaN, as do those whose weaker amplitude is not above the least, raw units.
     tap_sigma

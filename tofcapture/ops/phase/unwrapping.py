@@ -22,18 +22,8 @@ def unwrap(range_low: Float64, range_high: Float64, ambiguity_high: float, ambig
     """Unwrap the high frequency by the low one.
 
     ``k = round((r_low - r_high) / R_high) mod (R_low / R_high)``, method.md 4.3: for 20 and 100 MHz k is in 0..4. It fails
-    only where the two disagree by more than half of R_high (0.75 m).
-
-    Parameters
-    ----------
-    range_low, range_high
-        Wrapped ranges, metres, same shape.
-    ambiguity_high, ambiguity_low
-        Unambiguous ranges; the low one must be a whole multiple of the high one.
-
-    Returns
-    -------
-    Unwrapped range of the high frequency in [0, R_low), metres.
+    only where the two disagree by more than half of R_high (0.75 m). The low ambiguity must be a whole multiple of the high
+    one. The result is the range of the high frequency in [0, R_low), metres.
     """
     ratio = whole_ratio(ambiguity_low, ambiguity_high)
     k = np.mod(np.round((range_low - range_high) / ambiguity_high), ratio)
@@ -41,14 +31,9 @@ def unwrap(range_low: Float64, range_high: Float64, ambiguity_high: float, ambig
 
 
 def unwrap_spatial(
-    range_low: Float64,
-    range_high: Float64,
-    amplitude: Float64,
-    ambiguity_high: float,
-    ambiguity_low: float,
-    tap_sigma: float | Float64,
-    radius: int = 2,
-) -> Float64:
+    range_low: Float64, range_high: Float64, amplitude: Float64, ambiguity_high: float, ambiguity_low: float,
+    tap_sigma: float | Float64, radius: int = 2,
+) -> Float64:  # fmt: skip
     """Unwrap with the neighbours' support where a pixel alone cannot be sure.
 
     A pixel whose gap between the frequencies has a predicted standard deviation above a tenth of a wrap takes the low
@@ -60,16 +45,10 @@ def unwrap_spatial(
     ----------
     range_low, range_high, ambiguity_high, ambiguity_low
         As for :func:`unwrap`, of shape (H, W).
-    amplitude
-        (2, H, W) of the low and the high frequency, raw units.
-    tap_sigma
-        Standard deviation of a tap's noise, raw units, scalar or (H, W).
+    amplitude, tap_sigma
+        (2, H, W) of the low and the high frequency, and a tap's standard deviation, scalar or (H, W); raw units.
     radius
         Of the window, pixels.
-
-    Returns
-    -------
-    Unwrapped range of the high frequency in [0, R_low), metres.
     """
     alone = unwrap(range_low, range_high, ambiguity_high, ambiguity_low)
     ratio = whole_ratio(ambiguity_low, ambiguity_high)
