@@ -42,13 +42,12 @@ TOF_FLAG_DOCS = {
 class TofInfo:
     """What a ToF driver says of its camera without opening it."""
 
-    model: str  #: Free text.
+    model: str
     serial: str
-    camera: Camera  #: Intrinsics.
+    camera: Camera
     illuminator: Float64  #: (3,) light source in the ToF frame, metres.
-    #: (K,) frequency and demodulation phase of each raw channel: ``C_k = B + A cos(phi + phase_rad[k])``.
-    modulation_hz: tuple[float, ...] = PAPER_MODULATION_HZ
-    phase_rad: tuple[float, ...] = PAPER_PHASE_RAD
+    modulation_hz: tuple[float, ...] = PAPER_MODULATION_HZ  #: (K,) frequency of each raw channel.
+    phase_rad: tuple[float, ...] = PAPER_PHASE_RAD  #: (K,) ``C_k = B + A cos(phi + phase_rad[k])``.
     exposure: float = 400e-6  #: Integration time of one phase image, seconds.
     saturation: float = 4095.0  #: Raw value from which a tap is saturated.
     #: The camera's factory calibration, one per frequency; empty when it has none.
@@ -126,8 +125,8 @@ class Truth:
     depth: NDArray[np.float32]
     #: (2H, 2W, 3) float32, geometric normals in the ToF frame, unit, facing the camera.
     normals: NDArray[np.float32]
-    target: NDArray[np.bool_]  #: (2H, 2W) bool, the ray hits the scene's object (not table or background).
-    T_tof_stereo: Float64  #: (4, 4) of the true rig.
+    target: NDArray[np.bool_]  #: (2H, 2W) the ray hits the scene's object (not table or background).
+    T_tof_stereo: Float64  #: (4, 4) of the true rig, as is the next.
     T_flange_tof: Float64
 
 
@@ -135,12 +134,12 @@ class Truth:
 class View:
     """Everything captured at one pose of one scene."""
 
-    scene: str  #: Name of the scene (``calibration`` for board views), number of the view from 0.
-    index: int
-    tof: TofBurst  #: What the cameras handed over.
+    scene: str  #: ``calibration`` for board views.
+    index: int  #: Number of the view, from 0.
+    tof: TofBurst
     stereo: StereoFrame
-    arm_before: ArmState  #: Arm state before the first and after the last exposure.
-    arm_after: ArmState
+    arm_before: ArmState  #: Before the first exposure.
+    arm_after: ArmState  #: After the last exposure.
     rig: Rig  #: The rig as it was known when the view was taken.
     #: Strings and numbers: versions, seed, plan digest, UTC time ...
     provenance: Mapping[str, Any] = field(default_factory=dict)

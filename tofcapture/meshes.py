@@ -34,10 +34,7 @@ def metres_per(unit: str, where: str) -> float:
 def read_mesh(path: Path, unit: str) -> Mesh:
     """Read a PLY, OBJ or STL file whose numbers are in ``unit``.
 
-    Raises
-    ------
-    ConfigError
-        Missing, of another type, unreadable or without triangles.
+    :class:`ConfigError` when it is missing, of another type, unreadable or without triangles.
     """
     scale = metres_per(unit, str(path))
     if path.suffix.lower() not in SUFFIXES:
@@ -74,13 +71,8 @@ def extrude(outer: Float64, height: float, holes: Sequence[Float64] = ()) -> Mes
 def revolve(profile: ArrayLike, segments: int = 64) -> Mesh:
     """Build a solid of revolution about z.
 
-    Parameters
-    ----------
-    profile
-        (N, 2) of (radius, z): an open line from the axis to the axis with the solid on its left when walked with r to the
-        right and z upwards, so from the bottom along the outside to the top.
-    segments
-        Facets around the axis.
+    ``profile`` (N, 2) of (radius, z) is an open line from the axis to the axis with the solid on its left when walked with r
+    to the right and z upwards, so from the bottom along the outside to the top.
     """
     profile = np.asarray(profile, dtype=np.float64)
     if len(profile) < 3 or profile[0, 0] != 0 or profile[-1, 0] != 0 or (profile[1:-1, 0] <= 0).any():
@@ -187,26 +179,15 @@ def triangulate(outer: Float64, holes: Sequence[Float64] = ()) -> tuple[Float64,
 
     After D. Eberly, "Triangulation by Ear Clipping" (Geometric Tools, 2002); quadratic in the corners, a few hundred here.
 
-    Parameters
-    ----------
-    outer
-        (N, 2) simple polygon, either orientation.
-    holes
-        Simple polygons inside it that touch neither it nor each other, either orientation.
+    ``outer`` (N, 2) and ``holes``, which touch neither it nor each other, are simple polygons of either orientation;
+    :class:`ConfigError` when they cross, touch or have no area.
 
     Returns
     -------
-    points
-        (P, 2) all corners: the outline's, then each hole's.
-    triangles
-        (P + 2 H - 2, 3) int64, counter-clockwise, using every corner.
+    points, triangles
+        (P, 2) all corners, the outline's, then each hole's; (P + 2 H - 2, 3) counter-clockwise, using every corner.
     rings
         Indices of the outline (counter-clockwise) and of each hole (clockwise): the solid is on the left of each.
-
-    Raises
-    ------
-    ConfigError
-        When the polygons cross, touch or have no area.
     """
     polygons = [np.asarray(p, dtype=np.float64) for p in (outer, *holes)]
     starts = np.cumsum([0, *(len(p) for p in polygons)])

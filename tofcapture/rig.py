@@ -28,18 +28,16 @@ class RangeError:
     """
 
     modulation_hz: float  #: The frequency it belongs to.
-    offset: float = 0.0  #: Metres, metres per metre.
-    scale: float = 0.0
+    offset: float = 0.0  #: Metres.
+    scale: float = 0.0  #: Metres per metre.
     #: ``(m, a_m, b_m)``: order, cosine and sine amplitude in metres ("wiggling").
     harmonics: tuple[tuple[int, float, float], ...] = ()
     per_pixel_radius: float = 0.0  #: Metres per pixel of distance to the principal point.
     per_kelvin: float = 0.0  #: Metres per kelvin away from ``reference_celsius``.
     reference_celsius: float = 45.0
-    #: ``(i, j, c_ij)``: powers of x and y, and metres; what a pixel measures too long for its place in the
-    #: image.
+    #: ``(i, j, c_ij)``: powers of x and y, and metres; what a pixel measures too long for its place.
     image: tuple[tuple[int, int, float], ...] = ()
-    #: Metres times raw units of amplitude: what dark surfaces are measured too far.
-    per_inverse_amplitude: float = 0.0
+    per_inverse_amplitude: float = 0.0  #: Metres times raw units: what dark surfaces are measured too far.
 
     def at(
         self,

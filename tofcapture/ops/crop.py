@@ -41,10 +41,8 @@ PARALLEL = 0.05  # share of the points that makes a parallel plane below
 class Crop:
     """Where the scene's object is, ToF frame."""
 
-    #: Table plane ``normal . p = offset``, unit normal towards the camera, metres; ``normal`` is NaN when
-    #: there is no dominant plane.
-    normal: Float64
-    offset: float
+    normal: Float64  #: (3,) of the table ``normal . p = offset``, unit, towards the camera; NaN: no table.
+    offset: float  #: Metres.
     centre: Float64  #: (3,) what the camera looks at, metres.
     radius: float  #: Largest distance from the centre along the table, metres.
     clearance: float  #: Smallest height above the table, metres.

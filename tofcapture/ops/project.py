@@ -37,28 +37,21 @@ HIDES = 0.002  # m, and relative; a skirt hides the sheet when it is nearer by b
 class Sheet:
     """A triangulated stereo depth image."""
 
-    #: (SH, SW) float64, stereo frame, metres; holes are bridged along rows, NaN outside the outermost points
-    #: of a row.
-    depth: Float64
-    vertex: Bool  #: (SH, SW) bool, measured, or interpolated across a small hole of a smooth surface.
-    #: (SH-1, SW-1) bool, the quad between four neighbours is surface; other quads with four depths are skirt.
-    surface: Bool
-    #: (SH, SW) bool, interpolated across a small hole whose ends differ by more than neighbours on one
-    #: surface can: a step may hide in it.
-    doubtful: Bool
+    depth: Float64  #: (SH, SW) metres; bridged along rows, NaN outside the outermost points of a row.
+    vertex: Bool  #: (SH, SW) measured, or interpolated across a small hole of a smooth surface.
+    surface: Bool  #: (SH-1, SW-1) the quad of four neighbours is surface; others with four depths are skirt.
+    doubtful: Bool  #: (SH, SW) interpolated across a small hole in which a step may hide.
 
 
 @dataclass(frozen=True)
 class Projection:
     """What the ToF camera's rays meet."""
 
-    depth: Float64  #: (H, W) float64, metres; NaN: no surface.
-    #: (H, W, 2) float64, (u, v) on the stereo grid of the point that is met; NaN where depth is.
-    pixels: Float64
-    #: (H, W, 3) float64, of the triangles (noisy), ToF frame, unit, facing the camera; NaN where depth is.
-    normals: Float64
-    occluded: Bool  #: (H, W) bool, reasons to mistrust the pixel.
-    edge: Bool
+    depth: Float64  #: (H, W) metres; NaN: no surface, as for pixels and normals.
+    pixels: Float64  #: (H, W, 2) (u, v) on the stereo grid of the point that is met.
+    normals: Float64  #: (H, W, 3) of the triangles (noisy), ToF frame, unit, facing the camera.
+    occluded: Bool  #: (H, W) a reason to mistrust the pixel.
+    edge: Bool  #: (H, W) another one.
 
 
 def triangulate(depth: NDArray[np.floating], camera: Camera) -> Sheet:

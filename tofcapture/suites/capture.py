@@ -34,13 +34,12 @@ from tofcapture.suites.scene import Scene
 class Job:
     """One scene to capture."""
 
-    scene: Scene  #: What stands there; the seed of its rig: one camera, one bracket, one arm.
-    seed: int
-    views: int  #: Views of the scene, ToF frames of each burst.
-    frames: int
-    #: Overrides of the simulator's constants for the whole dataset; what every view says of its origin.
-    sim: Mapping[str, Any]
-    provenance: Mapping[str, Any]
+    scene: Scene
+    seed: int  #: Of its rig: one camera, one bracket, one arm.
+    views: int
+    frames: int  #: Of each ToF burst.
+    sim: Mapping[str, Any]  #: Overrides of the simulator's constants for the whole dataset.
+    provenance: Mapping[str, Any]  #: Stored in every view.
 
 
 def layered(*tables: Mapping[str, Any]) -> dict[str, Any]:

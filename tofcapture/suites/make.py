@@ -56,15 +56,16 @@ def make_scene(
 class DatasetSpec:
     """A dataset to simulate: everything that its bytes depend on, but for versions."""
 
-    suite: str  #: The recipe and its seed.
+    suite: str  #: The recipe.
     seed: int
-    scenes: int  #: How many: scenes, views of each, ToF frames of each view.
-    views: int = 25
-    frames: int = 10
+    scenes: int
+    views: int = 25  #: Of each scene.
+    frames: int = 10  #: ToF frames of each view.
     meshes: tuple[Path, ...] = ()  #: Files for the scenes of kind ``mesh``.
     mesh_unit: str = "mm"
-    #: Overrides of the simulator's constants, as in a station's ``[sim]``.
-    sim: Mapping[str, Any] = field(default_factory=dict)
+    sim: Mapping[str, Any] = field(
+        default_factory=dict
+    )  #: Overrides of constants, as in a station's ``[sim]``.
     #: Rigs that the scenes take turns with: each its own brackets, factory calibration and fixed pattern, so
     #: that a network cannot learn one camera by heart.
     cameras: int = 1
@@ -101,17 +102,16 @@ class DatasetSpec:
 class Made:
     """One finished scene, as ``simulation/<scene>.json`` says."""
 
-    scene: str  #: Name, digest of the shard, views in it.
-    sha256: str
+    scene: str
+    sha256: str  #: Of the shard.
     views: int
     task: str  #: :meth:`DatasetSpec.task` that it came from.
-    objects: list[str]  #: Identities of its objects, and what the recipe says of it.
-    facts: dict[str, Any]
-    #: CPU seconds by stage of the process that made it (``build`` is the shard's), and wall clock.
-    cpu: dict[str, float]
-    seconds: float
+    objects: list[str]  #: Identities of its objects.
+    facts: dict[str, Any]  #: What the recipe says of it.
+    cpu: dict[str, float]  #: Seconds by stage of the process that made it; ``build`` is the shard's.
+    seconds: float  #: Wall clock.
     bytes: int  #: Of the shard.
-    config: dict[str, Any]  #: Of the builder.
+    config: dict[str, Any]  #: Of the builder, as are the versions.
     versions: dict[str, str]
 
 

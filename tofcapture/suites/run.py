@@ -28,12 +28,11 @@ _CAPTURE = 0.7  # share of a view's work that is done when it is captured; the r
 class Simulated:
     """What a run did."""
 
-    dataset: Path  #: The folder.
-    made: tuple[Made, ...]  #: Scenes of this run, and those that were there.
-    kept: tuple[Made, ...]
-    splits: Mapping[str, str]  #: Split by scene.
-    #: Error of the ground truth (:meth:`TruthError.table`), ``None`` when no shard knows it.
-    gt: Mapping[str, Any] | None
+    dataset: Path
+    made: tuple[Made, ...]  #: Scenes of this run.
+    kept: tuple[Made, ...]  #: Scenes that were there.
+    splits: Mapping[str, str]  #: By scene.
+    gt: Mapping[str, Any] | None  #: :meth:`TruthError.table`; ``None`` when no shard knows the truth.
     seconds: float  #: Wall clock of the run.
 
 

@@ -87,10 +87,7 @@ class WorldFile:
 def read_constants(overrides: Mapping[str, Any], where: str) -> Constants:
     """Read the simulator's constants: constants.toml with ``overrides`` (tables of the same names) laid over it.
 
-    Raises
-    ------
-    ConfigError
-        On a key that constants.toml does not know, or a value that cannot be.
+    :class:`ConfigError` names a key that constants.toml does not know, or a value that cannot be.
     """
     defaults = tomllib.loads(Path(__file__).with_name("constants.toml").read_text(encoding="utf-8"))
 
@@ -129,13 +126,7 @@ def read_constants(overrides: Mapping[str, Any], where: str) -> Constants:
 
 
 def load_world(path: Path) -> WorldFile:
-    """Read a world file.
-
-    Raises
-    ------
-    ConfigError
-        Not TOML, unknown keys, missing meshes, transforms that are not rigid; the message names the place.
-    """
+    """Read a world file; :class:`ConfigError` names the place of an unknown key, a missing mesh, a pose that is not rigid."""
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as err:

@@ -62,14 +62,8 @@ def exact_view(
 ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
     """Measure as an ideal camera of these intrinsics would, at its pixel centres.
 
-    Returns
-    -------
-    depth
-        (H, W) float32, metres, NaN where nothing is met.
-    normals
-        (H, W, 3) float32, geometric, camera frame, facing the camera; NaN where nothing is met.
-    target
-        (H, W) bool, the scene's object is met.
+    Returns depth (H, W) float32, metres, geometric normals (H, W, 3) float32, camera frame, facing the camera, both NaN where
+    nothing is met; and (H, W) bool, the scene's object is met.
     """
     rays = camera.rays.reshape(-1, 3) / camera.ray_lengths.reshape(-1, 1)
     directions = rotate_vectors(T_world_camera, rays)
@@ -80,76 +74,47 @@ def exact_view(
     # The float32 distance of Embree is good to 1e-7; the plane of the triangle gives the rest in float64.
     corners = caster.geometry.corners[tri]
     plane = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    offset = np.einsum("ij,ij->i", plane, corners[:, 0] - T_world_camera[:3, 3])
     with np.errstate(divide="ignore", invalid="ignore"):
-        radial = np.einsum("ij,ij->i", plane, corners[:, 0] - T_world_camera[:3, 3]) / np.einsum(
-            "ij,ij->i", plane, directions
-        )
+        radial = offset / np.einsum("ij,ij->i", plane, directions)
     radial = np.where(np.abs(radial - hits.distance) < 1e-4, radial, hits.distance)
     depth = np.where(hits.found, radial, np.nan).reshape(camera.shape) / camera.ray_lengths
-    return (
-        depth.astype(np.float32),
-        normals.reshape(*camera.shape, 3).astype(np.float32),
-        (hits.found & caster.geometry.target[tri]).reshape(camera.shape),
-    )
+    target = (hits.found & caster.geometry.target[tri]).reshape(camera.shape)
+    return depth.astype(np.float32), normals.reshape(*camera.shape, 3).astype(np.float32), target
 
 
 def light_at_pixels(
-    caster: Caster,
-    camera: Camera,
-    T_world_tof: Float64,
-    lamp: Lamp,
-    hz: Sequence[float],
-    transport: Transport | None,
-    subpixels: int = 4,
-    rays: int = 64,
-) -> Light:
+    caster: Caster, camera: Camera, T_world_tof: Float64, lamp: Lamp, hz: Sequence[float],
+    transport: Transport | None, subpixels: int = 4, rays: int = 64,
+) -> Light:  # fmt: skip
     """Render the phasors of one pose.
 
-    Parameters
-    ----------
-    caster, camera, T_world_tof
-        The scene, intrinsics and pose of the ToF camera.
-    lamp, hz
-        The illuminator, world frame; modulation frequencies, ascending.
-    transport
-        Light between surfaces; ``None`` leaves direct light only.
-    subpixels, rays
-        Points per pixel along each axis; rays of the last indirect bounce, per pixel.
+    ``hz`` are modulation frequencies, ascending, and ``transport`` is light between surfaces; ``None`` leaves direct light only.
+    A pixel has ``subpixels`` points along each axis, and ``rays`` rays of the last indirect bounce.
     """
     k = wavenumbers(hz)
-    eye = _Eye(caster, camera, T_world_tof, lamp, k)
+
+    def look(subpixels: int, pixels: Int64) -> tuple[_Samples, Complex64]:
+        """Sample the given pixels, pixel by pixel; with the direct irradiance (len(k), N) there."""
+        own = None if subpixels == 1 else _within(camera, subpixels, pixels)
+        samples = _look(caster, camera.scaled(subpixels), T_world_tof, own)
+        seen = np.flatnonzero(samples.found)
+        out = np.zeros((len(k), len(samples.points)), dtype=np.complex64)
+        out[:, seen] = direct(caster, samples.points[seen], samples.normals[seen], lamp, k)
+        return samples, out
+
     coarse = _look(caster, camera, T_world_tof)
     indirect = None if transport is None else _indirect(coarse, camera, lamp, transport, rays)
     # A pixel on one smooth surface is sampled half as finely: what it averages over changes linearly across it.
     first = subpixels // 2 if subpixels % 2 == 0 else subpixels
-    samples, direct_light = eye.look(first, np.arange(coarse.found.size))
+    samples, direct_light = look(first, np.arange(coarse.found.size))
     total = _means(samples, direct_light, indirect, coarse, camera, np.arange(coarse.found.size), k)
     if first < subpixels:
         odd = np.flatnonzero(_broken(samples, direct_light[0].real > 0, camera, first))
-        samples, direct_light = eye.look(subpixels, odd)
+        samples, direct_light = look(subpixels, odd)
         total[:, odd] = _means(samples, direct_light, indirect, coarse, camera, odd, k)
     total = total.reshape(len(k), *camera.shape)
     return Light(phasor=total[1:], steady=total[0].real)
-
-
-@dataclass(frozen=True)
-class _Eye:
-    """A camera and a lamp in a scene."""
-
-    caster: Caster
-    camera: Camera
-    T_world_camera: Float64
-    lamp: Lamp
-    k: tuple[float, ...]
-
-    def look(self, subpixels: int, pixels: Int64) -> tuple[_Samples, Complex64]:
-        """Sample the given pixels, pixel by pixel; with the direct irradiance (len(k), N) there."""
-        own = None if subpixels == 1 else _within(self.camera, subpixels, pixels)
-        samples = _look(self.caster, self.camera.scaled(subpixels), self.T_world_camera, own)
-        seen = np.flatnonzero(samples.found)
-        out = np.zeros((len(self.k), len(samples.points)), dtype=np.complex64)
-        out[:, seen] = direct(self.caster, samples.points[seen], samples.normals[seen], self.lamp, self.k)
-        return samples, out
 
 
 def _within(camera: Camera, subpixels: int, pixels: Int64) -> Int64:

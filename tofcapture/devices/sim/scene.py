@@ -31,8 +31,8 @@ _LIFT = 2e-5
 class SceneObject:
     """One Lambertian triangle mesh."""
 
-    vertices: Float64  #: (N, 3) float64, object frame, metres, and (M, 3) int indices into them.
-    triangles: Int64
+    vertices: Float64  #: (N, 3) float64, object frame, metres.
+    triangles: Int64  #: (M, 3) indices into the vertices.
     albedo: float  #: Diffuse reflectance at the illuminator's wavelength, in [0, 1].
     T_world_object: Float64  #: (4, 4).
     target: bool = True  #: True for the scene's object, False for table, walls and clutter.
@@ -60,13 +60,11 @@ class SceneObject:
 class Geometry:
     """All triangles of a scene, merged, world frame."""
 
-    #: (M, 3, 3) float64, metres, and (M, 3) float32 unit geometric normals by the winding.
-    corners: NDArray[np.float64]
-    normals: Float32
-    #: (M,) float32; int64 index of the scene object; bool, the triangle belongs to the scene's object.
-    albedo: Float32
-    owner: Int64
-    target: NDArray[np.bool_]
+    corners: Float64  #: (M, 3, 3), metres.
+    normals: Float32  #: (M, 3) unit geometric normals by the winding.
+    albedo: Float32  #: (M,)
+    owner: Int64  #: (M,) index of the scene object.
+    target: NDArray[np.bool_]  #: (M,) the triangle belongs to the scene's object.
 
 
 def merge(objects: Sequence[SceneObject]) -> Geometry:

@@ -50,19 +50,15 @@ def scene_objects(
 ) -> list[SceneObject]:
     """Put everything into a scene, in the base frame.
 
+    First come the objects (``target=True``), then table, pedestal, walls and clutter.
+
     Parameters
     ----------
-    name
+    name, seed
         ``calibration`` for the board; a mesh's name; a family of :data:`shapes.FAMILIES`, optionally with ``-<n>`` behind
         it (``mug``, ``mug-2``); anything else is a seeded combination of one to four objects (``random-7``).
-    seed
-        The world's seed.
     meshes, mesh_unit
         Name -> PLY, OBJ or STL file, and their unit: ``m``, ``cm`` or ``mm``.
-
-    Returns
-    -------
-    Objects (``target=True``), then table, pedestal, walls and clutter.
     """
     if name == CALIBRATION:
         return [*_calibration(), *surroundings(name, seed, clutter=False)]

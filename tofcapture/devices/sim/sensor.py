@@ -27,35 +27,26 @@ _FEW = 200.0  # electrons; below, shot noise is drawn from the Poisson distribut
 class Sensor:
     """Constants of the sensor; docs/simulator.md explains where they come from."""
 
-    #: (K,) frequency and demodulation phase of each raw channel.
-    modulation_hz: tuple[float, ...] = PAPER_MODULATION_HZ
-    phase_rad: tuple[float, ...] = PAPER_PHASE_RAD
-    #: Raw units that a white surface (albedo 1) facing the camera at 1 m adds to each tap in the nominal
-    #: exposure; raw units added to each tap, not modulated.
-    signal: float = 280.0
-    #: (F,) demodulation contrast A / B of each frequency, ascending.
-    contrast: tuple[float, ...] = (0.85, 0.6)
-    exposure: float = 400e-6  #: Seconds; the signal scales with their ratio.
+    modulation_hz: tuple[float, ...] = PAPER_MODULATION_HZ  #: (K,) of each raw channel.
+    phase_rad: tuple[float, ...] = PAPER_PHASE_RAD  #: (K,) demodulation phase of each raw channel.
+    signal: float = 280.0  #: Raw units that white, facing, at 1 m adds to a tap in the nominal exposure.
+    contrast: tuple[float, ...] = (0.85, 0.6)  #: (F,) A / B of each frequency, ascending.
+    exposure: float = 400e-6  #: Seconds; the signal scales with its ratio to the nominal one.
     nominal_exposure: float = 400e-6
-    ambient: float = 20.0
-    electrons_per_unit: float = 16.0  #: Photo-electrons per raw unit; electrons, standard deviation, per tap.
-    read_noise: float = 20.0
+    ambient: float = 20.0  #: Raw units added to each tap, not modulated.
+    electrons_per_unit: float = 16.0  #: Photo-electrons per raw unit.
+    read_noise: float = 20.0  #: Electrons, standard deviation, per tap.
     full_scale: float = 4095.0  #: Largest raw value; taps clip there.
-    #: True systematic error of each frequency (offset, wiggling, radius, temperature).
-    range_errors: tuple[RangeError, ...] = ()
-    #: ``(m, a_m)``: the correlation waveform is ``cos x + sum a_m cos m x``; a square wave on a square wave
-    #: has 1/9, 1/25.
+    range_errors: tuple[RangeError, ...] = ()  #: True systematic error of each frequency.
+    #: ``(m, a_m)``: the correlation waveform is ``cos x + sum a_m cos m x``; square waves have 1/9, 1/25.
     harmonics: tuple[tuple[int, float], ...] = ()
     pixel_offset: float = 0.0005  #: Standard deviation of the fixed range offset of each pixel, metres.
-    #: Share of the light that the lens scatters, and the scale of its halo as a share of the image width.
-    scattering: float = 0.004
-    scattering_radius: float = 0.15
-    celsius: float = 45.0  #: Mean temperature and standard deviation of its frame-to-frame wander.
-    celsius_drift: float = 0.3
-    #: Round to whole raw units and clip at ``full_scale``, else raw is float64; draw Poisson numbers of
-    #: electrons.
-    quantise: bool = True
-    shot_noise: bool = True
+    scattering: float = 0.004  #: Share of the light that the lens scatters.
+    scattering_radius: float = 0.15  #: Scale of its halo as a share of the image width.
+    celsius: float = 45.0  #: Mean temperature.
+    celsius_drift: float = 0.3  #: Standard deviation of its wander from frame to frame.
+    quantise: bool = True  #: Round to whole raw units and clip at ``full_scale``; otherwise raw is float64.
+    shot_noise: bool = True  #: Draw Poisson numbers of electrons.
 
 
 def check_channels(sensor: Sensor, where: str) -> None:
@@ -84,18 +75,8 @@ def check_channels(sensor: Sensor, where: str) -> None:
 
 def ideal(sensor: Sensor) -> Sensor:
     """Return the same sensor with every imperfection off; taps are exact and float64."""
-    return replace(
-        sensor,
-        ambient=0.0,
-        read_noise=0.0,
-        range_errors=(),
-        harmonics=(),
-        pixel_offset=0.0,
-        scattering=0.0,
-        celsius_drift=0.0,
-        quantise=False,
-        shot_noise=False,
-    )
+    off = dict.fromkeys(("ambient", "read_noise", "pixel_offset", "scattering", "celsius_drift"), 0.0)
+    return replace(sensor, **off, range_errors=(), harmonics=(), quantise=False, shot_noise=False)
 
 
 @lru_cache(maxsize=4)
@@ -135,21 +116,9 @@ def expose(
 ) -> tuple[NDArray[Any], Float64]:
     """Take a static burst.
 
-    Parameters
-    ----------
-    light, sensor, info
-        What reaches the pixels, the electronics, channels and intrinsics.
-    frames, rng
-        Frames of this burst, and its noise.
-    serial
-        Seeds what is fixed in this one camera: the offset of each pixel.
-
-    Returns
-    -------
-    raw
-        (frames, K, H, W) uint16, or float64 when the sensor does not quantise.
-    celsius
-        (frames,) temperature.
+    ``light`` is what reaches the pixels, ``info`` has channels and intrinsics, ``rng`` draws the noise of this burst. ``serial``
+    seeds what is fixed in this one camera: the offset of each pixel. Returns raw (frames, K, H, W), uint16, or float64 when
+    the sensor does not quantise, and the temperatures (frames,).
     """
     celsius = sensor.celsius + sensor.celsius_drift * rng.standard_normal(frames)
     gain = sensor.signal * sensor.exposure / sensor.nominal_exposure

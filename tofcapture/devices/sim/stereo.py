@@ -18,18 +18,13 @@ class StereoModel:
     """Constants of the stereo camera; docs/simulator.md explains where they come from."""
 
     baseline: float = 0.10  #: Distance of the right eye along x, metres.
-    #: Standard deviations in pixels: of disparities after matching (depth noise is ``z^2 / (f b)`` times it),
-    #: and of the Gaussian that correlates the noise, the matching window's doing.
-    disparity_noise: float = 0.025
-    correlation: float = 1.5
-    #: Lost are surfaces seen at more than this angle from their normal, radians, of a lower albedo, or
-    #: deeper, metres.
-    grazing: float = np.radians(78.0)
-    darkest: float = 0.02
-    #: Shares of points beside a depth edge that are matched wrongly, and of points lost anywhere.
-    edge_outliers: float = 0.3
-    dropout: float = 0.001
-    far: float = 3.0
+    disparity_noise: float = 0.025  #: Pixels after matching; depth noise is ``z^2 / (f b)`` times it.
+    correlation: float = 1.5  #: Pixels of the Gaussian that correlates noise, the matching window's doing.
+    grazing: float = np.radians(78.0)  #: Surfaces at more than this from their normal are lost, radians.
+    darkest: float = 0.02  #: Surfaces with a lower albedo are lost.
+    edge_outliers: float = 0.3  #: Share of points beside a depth edge that are matched wrongly.
+    dropout: float = 0.001  #: Share of points lost anywhere.
+    far: float = 3.0  #: Points beyond this depth are lost, metres.
 
 
 def ideal(model: StereoModel) -> StereoModel:

@@ -34,10 +34,8 @@ class Lamp:
     position: NDArray[np.float64]  #: (3,) world frame, metres.
     #: (3,) unit, where it points.
     axis: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    #: Full strength within this angle of the axis, radians; from there a smooth step to nothing.
-    half_angle: float = np.pi
-    #: Width of that step, radians. ``half_angle`` of pi is a lamp that shines equally in all directions.
-    edge: float = 0.0
+    half_angle: float = np.pi  #: Full strength within this angle of the axis, radians; pi: in all directions.
+    edge: float = 0.0  #: Width of a smooth step to nothing from there, radians.
 
     def strength(self, towards: Float32) -> Float32 | float:
         """Compute the intensity in unit directions (N, 3) away from the lamp, 1 on the axis."""
@@ -54,27 +52,16 @@ def wavenumbers(hz: Sequence[float]) -> tuple[float, ...]:
     return (0.0, *(2 * np.pi * f / SPEED_OF_LIGHT for f in hz))
 
 
-def _frames(normals: Float32) -> tuple[Float32, Float32]:
-    """Two unit vectors (N, 3) that stand upright on each unit normal (N, 3) and on each other."""
+def _cosine_directions(normals: Float32, u: NDArray[Any], v: NDArray[Any]) -> Float32:
+    """Draw cosine-weighted directions (N, R, 3) about unit normals (N, 3) from numbers u, v (N, R) in [0, 1)."""
     x, y, z = (normals[:, k] for k in range(3))
     sign = np.where(z >= 0, np.float32(1), np.float32(-1))
     a = -1 / (sign + z)
-    b = x * y * a  # branchless frame: Duff et al., JCGT 6(1), 2017
+    b = x * y * a  # two vectors upright on the normal, without a branch: Duff et al., JCGT 6(1), 2017
     first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
     second = np.stack([b, sign + y * y * a, -y], axis=1)
-    return first, second
-
-
-def _cosine_weighted(u: NDArray[Any], v: NDArray[Any]) -> tuple[Float32, Float32, Float32]:
-    """Coordinates of cosine-weighted directions, the normal last, from numbers u, v in [0, 1)."""
     r, angle = np.sqrt(u).astype(np.float32), (2 * np.pi * v).astype(np.float32)
-    return r * np.cos(angle), r * np.sin(angle), np.sqrt(np.maximum(0, 1 - u)).astype(np.float32)
-
-
-def _cosine_directions(normals: Float32, u: NDArray[Any], v: NDArray[Any]) -> Float32:
-    """Cosine-weighted directions (N, R, 3) about unit normals (N, 3) from numbers u, v (N, R) in [0, 1)."""
-    first, second = _frames(normals)
-    p, q, w = _cosine_weighted(u, v)
+    p, q, w = r * np.cos(angle), r * np.sin(angle), np.sqrt(np.maximum(0, 1 - u)).astype(np.float32)
     out = np.empty((*p.shape, 3), dtype=np.float32)
     for k in range(3):
         np.multiply(p, first[:, k, None], out=out[..., k])
@@ -89,10 +76,7 @@ def direct(
     """Compute irradiance phasors straight from a point light.
 
     ``points`` and ``normals`` are (N, 3), world frame; the normal names the side that is looked at. ``k`` are wavenumbers.
-
-    Returns
-    -------
-    (len(k), N) complex64, strength x ``cos / d^2 exp(i k d)``, zero in shadow and from behind; 1/m^2.
+    Returns (len(k), N) complex64, strength x ``cos / d^2 exp(i k d)``, zero in shadow and from behind; 1/m^2.
     """
     strength, d, lit = _lit(caster, points.astype(np.float32), normals, lamp)
     h = np.zeros((len(k), len(points)), dtype=np.complex64)
@@ -128,11 +112,11 @@ def turn(phase: NDArray[Any]) -> Complex64:
 class Patches:
     """The surfaces cut into patches: each triangle in n x n barycentric cells, neighbouring cells of like normal joined."""
 
-    divisions: Int64  #: (M,) n of each triangle, and where its cells begin in ``patch_of_cell``.
-    first: Int64
+    divisions: Int64  #: (M,) n of each triangle.
+    first: Int64  #: (M,) where its cells begin in ``patch_of_cell``.
     patch_of_cell: Int64  #: (C,) patch of each cell; -1 for cells outside the triangle.
-    cells: Int64  #: (S,) indices of real cells, sorted by patch, and their areas, m^2.
-    cell_area: NDArray[np.float64]
+    cells: Int64  #: (S,) indices of real cells, sorted by patch.
+    cell_area: NDArray[np.float64]  #: (S,) their areas, m^2.
     start: Int64  #: (P + 1,) where each patch begins in ``cells``.
 
     @property
@@ -218,8 +202,7 @@ class Transport:
         self.patches = cut_patches(caster.geometry, budget)
         self._rng = np.random.default_rng(20_100)  # the same scene gives the same matrices
         points, normals, albedo = self._sample(rays)
-        self._points, self._normals = points, normals
-        self._rays = rays
+        self._points, self._normals, self._rays = points, normals, rays
         self.albedo: Float32 = albedo
         self.matrices = self._trace(points, normals)
 
@@ -303,21 +286,9 @@ class Transport:
     ) -> Complex64:
         """Compute indirect irradiance phasors at points: the last bounce by rays, the ones before from the solution.
 
-        Parameters
-        ----------
-        points, normals
-            (N, 3), world frame.
-        lamp, solution
-            The illuminator, and what :meth:`solve` returned for it.
-        rays
-            Rays per point.
-        pattern
-            (N,) small integers: points with different numbers use different directions (interleaved sampling), so that
-            a filter over neighbours sees them all.
-
-        Returns
-        -------
-        (len(k), N) complex64, 1/m^2
+        ``points`` and ``normals`` are (N, 3), world frame, ``solution`` is what :meth:`solve` returned for the lamp, ``rays``
+        are those of each point. Points of different ``pattern`` (N,), small integers, use different directions (interleaved
+        sampling), so that a filter over neighbours sees them all. Returns (len(k), N) complex64, 1/m^2.
         """
         count = len(points)
         total = np.zeros((len(self.k), count), dtype=np.complex64)

@@ -253,14 +253,7 @@ def shared_world(context: StationContext) -> SimWorld:
 def simulate(path: Path, *, ideal: bool, frames: int) -> View:
     """Render one view of a world file.
 
-    Parameters
-    ----------
-    path
-        The world file.
-    ideal
-        Switch every sensor imperfection and quantisation off; raw is float64 then.
-    frames
-        Frames in the burst.
+    ``ideal`` switches every sensor imperfection and quantisation off; raw is float64 then. ``frames`` are those of the burst.
     """
     file = load_world(path)
     constants = file.constants.idealised() if ideal else file.constants
