@@ -75,7 +75,9 @@ def check_channels(sensor: Sensor, where: str) -> None:
 
 def ideal(sensor: Sensor) -> Sensor:
     """Return the same sensor with every imperfection off; taps are exact and float64."""
-    off = dict.fromkeys(("ambient", "read_noise", "pixel_offset", "scattering", "celsius_drift"), 0.0)
+    off: dict[str, Any] = dict.fromkeys(
+        ("ambient", "read_noise", "pixel_offset", "scattering", "celsius_drift"), 0.0
+    )
     return replace(sensor, **off, range_errors=(), harmonics=(), quantise=False, shot_noise=False)
 
 
