@@ -34,7 +34,7 @@ lint: $(STAMP)
 	$(VENV)/bin/lint-imports
 
 docs: $(STAMP)
-	$(VENV)/bin/python -m tofcapture.files.page > docs/formats.md
+	$(VENV)/bin/python -m tofcapture.files.layout > docs/formats.md
 	$(VENV)/bin/python -m tofcapture.record.daemon.app > docs/openapi.json
 	$(VENV)/bin/python -m sphinx -q -W --keep-going -b html docs build/docs
 

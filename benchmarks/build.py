@@ -23,22 +23,11 @@ import numpy as np
 
 from benchmarks import build_peer
 from tofcapture.dataset.build import build_dataset, scene_tasks
-from tofcapture.dataset.sample import (
-    SampleConfig,
-    _sparse_points,
-    assemble,
-    decode_burst,
-    make_sample,
-    smoothed,
-)
+from tofcapture.dataset.sample import SampleConfig, decoder_for, make_sample
 from tofcapture.dataset.truth import view_error
 from tofcapture.files.seal import sealed_digest
-from tofcapture.files.shard_writer import ShardWriter
+from tofcapture.files.shard import ShardWriter
 from tofcapture.files.view import read_depth_view
-from tofcapture.ops.crop import crop_depth, find_crop
-from tofcapture.ops.denoise import denoise
-from tofcapture.ops.normals import PlaneField
-from tofcapture.ops.project import project, triangulate
 
 
 def cpu() -> float:
@@ -66,29 +55,15 @@ class Stages:
 def stages(paths: list[Path], rig, folder: Path) -> Stages:
     """Every stage of some views, one after the other, in this process."""
     run, config = Stages(), SampleConfig()
+    decoder = run("tables of the decoder", decoder_for, read_depth_view(paths[0])[0], rig)
     for path in paths:
         run("digest of the view", sealed_digest, path)
         view, depth = run("read the view", read_depth_view, path)
+        run("decode ToF", decoder.burst, view.tof.raw, 40.0)
         rng = np.random.default_rng(view.index)
-        run("decode ToF", decode_burst, view.tof, view.tof.info)
-        native = np.where(run("denoise", denoise, depth, rig.stereo), depth, np.float32(np.nan))
-        sheet = run("triangulate", triangulate, native, rig.stereo)
-        field = run("sums for planes", PlaneField, np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
-        up = (view.arm_before.T_base_flange @ rig.T_flange_tof)[2, :3]
-        crop = run("crop", lambda n=native, u=up, g=rng: find_crop(_sparse_points(n, rig, config.far), u, g))
-        run("crop native", crop_depth, crop, native, rig.stereo, rig.T_tof_stereo)
-        for scale in (1, 2):
-            camera = rig.tof.scaled(scale)
-            found = run(
-                f"project {scale}x", project, sheet, rig.stereo, rig.T_tof_stereo, camera, scale, config.far
-            )
-            found = run(f"planes {scale}x", smoothed, found, field, rig, camera)
-            run(f"mask {scale}x", assemble, found, rig, camera, crop)
-        sample = run(
-            "ALL OF make_sample", make_sample, view, rig, config, np.random.default_rng(view.index), depth
-        )
+        sample = run("all of make_sample", make_sample, view, rig, config, rng, decoder, depth)
         with ShardWriter(folder / "s.h5", view.scene, rig, view.tof.info, view.stereo.info, 1) as shard:
-            run("compress", shard.add, sample, path)
+            run("write", shard.add, sample)
             run("verify, fsync", shard.seal, {})
     return run
 
@@ -140,7 +115,9 @@ def peer(paths: list[Path], rig, folder: Path, ours: float, our_cpu: float) -> N
           f"ours is {ours / theirs:.1f} times as fast, {used / len(paths) / our_cpu:.1f} times by CPU")  # fmt: skip
     errors = {"ours": [], "plain, its ICP": [], "plain, true rig": []}
     for arrays, view in both:
-        sample = make_sample(view, rig, SampleConfig(), np.random.default_rng(view.index))
+        sample = make_sample(
+            view, rig, SampleConfig(), np.random.default_rng(view.index), decoder_for(view, rig)
+        )
         errors["ours"].append(view_error(sample, view).errors)
         good = sample.ground_truth[2].mask == 0
         for name, key in (("plain, its ICP", "icp"), ("plain, true rig", "rig")):

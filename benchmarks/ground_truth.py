@@ -16,19 +16,20 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofcapture.dataset.sample import SampleConfig, make_sample
-from tofcapture.dataset.truth import CropShares, class_errors, crop_shares
+from tofcapture.dataset.sample import SampleConfig, decoder_for, make_sample
 from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.scene import SceneObject
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
 from tofcapture.devices.sim.shapes import board
 from tofcapture.devices.sim.stereo import ideal
 from tofcapture.devices.sim.world import SimWorld
-from tofcapture.frames import ArmState, View
+from tofcapture.files.layout import MaskBit
+from tofcapture.files.shard import GroundTruth
+from tofcapture.frames import ArmState, Truth, View
 from tofcapture.meshes import Mesh, cuboid, move
 from tofcapture.o3d import load_open3d
 from tofcapture.ops.denoise import denoise
@@ -37,6 +38,75 @@ from tofcapture.poses import exp, invert, look_at, transform
 FAST = {"render": {"multipath": False, "subpixels": 1}}  # the ToF camera's light is no matter here
 DISTANCES = (0.45, 0.8, 1.4)
 DIRECTIONS = ((0.0, 0.3), (0.7, 0.2), (-0.5, -0.6))  # x and y per unit of height
+
+
+WRONG = 0.002  # m; a pixel whose depth is off by more is wrong
+THROUGH = 0.005  # m; a pixel whose depth lies this far behind the truth shows what is behind it
+
+
+@dataclass(frozen=True)
+class ClassError:
+    """Errors of the pixels of one mask class.
+
+    Attributes
+    ----------
+    errors
+        (n,) float32 absolute depth errors, metres; infinite where the truth has no surface.
+    through
+        Pixels whose depth lies behind the true surface: background seen through it.
+    """
+
+    errors: np.ndarray
+    through: int
+
+    @property
+    def wrong(self) -> float:
+        """Share of pixels that are off by more than :data:`WRONG`."""
+        return float((self.errors > WRONG).mean()) if len(self.errors) else 0.0
+
+
+@dataclass(frozen=True)
+class CropShares:
+    """Of the pixels with sound depth, no edge among them: those of the object, those the crop keeps; the same of the rest."""
+
+    target: int
+    target_kept: int
+    other: int
+    other_kept: int
+
+
+def mask_classes(mask: np.ndarray) -> dict[str, np.ndarray]:
+    """Pixels (H, W) of each class.
+
+    ``object`` carries no bit and ``table`` only OUTSIDE; the others are the pixels with depth that carry a bit, whatever else
+    they carry, edge pixels only under ``edge``.
+    """
+    edge = (mask & MaskBit.EDGE) > 0
+    hit = (mask & MaskBit.NOT_HIT) == 0
+    return {
+        "object": mask == 0,
+        "table": mask == MaskBit.OUTSIDE,
+        "edge": hit & edge,
+        "grazing": hit & ~edge & ((mask & MaskBit.GRAZING) > 0),
+        "occluded": hit & ~edge & ((mask & MaskBit.OCCLUDED) > 0),
+    }
+
+
+def class_errors(gt: GroundTruth, truth: Truth) -> dict[str, ClassError]:
+    """Errors of ground truth at 2x, by mask class."""
+    error = gt.depth - truth.depth
+    absolute = np.where(np.isfinite(error), np.abs(error), np.float32(np.inf))
+    return {
+        name: ClassError(absolute[where], int((error[where] > THROUGH).sum()))
+        for name, where in mask_classes(gt.mask).items()
+    }
+
+
+def crop_shares(gt: GroundTruth, truth: Truth) -> CropShares:
+    """What the crop keeps of the object and of everything else, at 2x."""
+    sound = (gt.mask & ~np.uint8(MaskBit.OUTSIDE)) == 0
+    target, other, kept = sound & truth.target, sound & ~truth.target, gt.mask == 0
+    return CropShares(*(int(m.sum()) for m in (target, target & kept, other, other & kept)))
 
 
 def target(mesh: Mesh, albedo: float, x: float = 0.0, y: float = 0.0) -> SceneObject:
@@ -170,7 +240,9 @@ def main() -> None:
     for name in args.scenes.split(","):
         mine, my_crops, my_angles = {}, [], []
         for view, exact in views(name, args.seed, distances):
-            sample = make_sample(view, view.rig, SampleConfig(), np.random.default_rng(view.index))
+            sample = make_sample(
+                view, view.rig, SampleConfig(), np.random.default_rng(view.index), decoder_for(view, view.rig)
+            )
             for key, error in class_errors(sample.ground_truth[2], view.truth).items():
                 mine.setdefault(key, []).append(error)
                 everything.setdefault(key, []).append(error)

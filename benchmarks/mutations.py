@@ -31,8 +31,7 @@ from tofcapture.dataset.card import write_card
 from tofcapture.errors import TofError
 from tofcapture.files.check import check
 from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
-from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardReader, TofMaps
-from tofcapture.files.shard_writer import ShardWriter
+from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardReader, ShardWriter, TofMaps
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.poses import exp
 from tofcapture.rig import Rig

@@ -1,16 +1,15 @@
-"""How fast one random training sample is read: shard, cache, flat memory map, TensorDataset; and what compression costs.
+"""How fast one random training sample is read: shard, cache, flat memory map; and what compression costs.
 
     python benchmarks/reader.py [--dataset DATASET --split train] [--seconds 3]
 
 A sample is one raw frame and its view's depth, normals and mask at 2x: 3.6 MB at full size. Without ``--dataset`` a synthetic one
 is written to a temporary folder: smooth scenes, taps with shot noise. Everything is read from the page cache, many times; a disk
-slower than memory makes the smaller form faster. The project's own figures stand beside those of its peers in one run.
+slower than memory makes the smaller form faster.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -19,23 +18,20 @@ from typing import Any
 
 import h5py
 import numpy as np
-import torch
-from torch.utils.data import DataLoader, Dataset, RandomSampler, TensorDataset
 
 from tofcapture.camera import Camera
-from tofcapture.files.cache import open_cache, pack
-from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
-from tofcapture.files.shard import GroundTruth, Sample, TofMaps
-from tofcapture.files.shard_writer import ShardWriter
+from tofcapture.files.cache import PackedScene, pack
+from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
+from tofcapture.files.shard import GroundTruth, Sample, ShardReader, ShardWriter, TofMaps
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.ops.normals import normals_from_depth
 from tofcapture.ops.phase import ambiguity, frequencies, radial_to_range, taps
 from tofcapture.rig import Rig
-from tofcapture_model.data import open_scenes
 
 TOF = Camera(240, 180, 190.6, 200.8, 116.8, 101.5)
 STEREO = Camera(1280, 1024, 1400.0, 1400.0, 639.5, 511.5)
-FRAMES, BATCH, WORKERS = 10, 8, 2
+FRAMES = 10
+NAMES = ("tof/raw", "gt/depth_2x", "gt/normals_2x", "gt/mask_2x")
 
 
 def synthetic_sample(index: int) -> Sample:
@@ -105,75 +101,18 @@ def rates(readers: dict[str, Callable[[int], object]], count: int, seconds: floa
     return best
 
 
-class Samples(Dataset[list[torch.Tensor]]):
-    """What training reads: one raw frame and its view's ground truth, of shards or of a cache."""
-
-    def __init__(self, folder: Path, split: str, cache: Path | None = None) -> None:
-        self.readers = open_scenes(folder, split, cache)
-        self.samples = [
-            (name, view, frame)
-            for name, reader in self.readers.items()
-            for view in range(reader.views)
-            for frame in range(reader.frames)
-        ]
-
-    def __len__(self) -> int:
-        return len(self.samples)
-
-    def __getitem__(self, i: int) -> list[torch.Tensor]:
-        name, view, frame = self.samples[i]
-        reader = self.readers[name]
-        gt = reader.ground_truth(view, 2)
-        return [torch.from_numpy(a.copy()) for a in (reader.raw(view, frame), gt.depth, gt.normals, gt.mask)]
+def sample(reader: ShardReader | PackedScene, view: int, frame: int) -> list[np.ndarray]:
+    """One training sample, in memory of its own."""
+    return [np.array(a) for a in (reader.raw(view, frame), *vars(reader.ground_truth(view, 2)).values())]
 
 
-class UncompressedShards:
+def unfiltered(path: Path, out: Path) -> list[h5py.Dataset]:
     """The same chunks, neither compressed nor checked."""
-
-    names = ("tof/raw", "gt/depth_2x", "gt/normals_2x", "gt/mask_2x")
-
-    def __init__(self, data: Samples, path: Path) -> None:
-        with h5py.File(path, "w") as out:
-            for reader in data.readers.values():
-                with h5py.File(reader.path) as source:
-                    for name in self.names:
-                        whole = source[name]
-                        out.create_dataset(f"{reader.scene}/{name}", data=whole[()], chunks=whole.chunks)
-        self.samples, file = data.samples, h5py.File(path)
-        self.sets = {s: [file[f"{s}/{name}"] for name in self.names] for s in data.readers}
-
-    def __getitem__(self, i: int) -> list[np.ndarray]:
-        name, view, frame = self.samples[i]
-        raw, *maps = self.sets[name]
-        return [raw[view, frame], *(d[view] for d in maps)]
-
-
-def tensors(data: Samples) -> TensorDataset:
-    """All samples in memory, ground truth repeated for every frame: the plain PyTorch peer."""
-    return TensorDataset(*(torch.stack(x) for x in zip(*(data[i] for i in range(len(data))), strict=True)))
-
-
-def processor_time(pids: list[int]) -> float:
-    """Seconds of CPU that processes have used (Linux)."""
-    fields = [Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split() for pid in pids]
-    return sum(int(f[11]) + int(f[12]) for f in fields) / os.sysconf("SC_CLK_TCK")
-
-
-def loader_rate(data: Dataset[Any], seconds: float) -> tuple[float, float]:
-    """Samples per second that arrive from two workers, and the CPU of all three processes for one, in seconds."""
-    sampler = RandomSampler(data, replacement=True, num_samples=1 << 20)  # type: ignore[arg-type]
-    loader = DataLoader(data, BATCH, sampler=sampler, num_workers=WORKERS, multiprocessing_context="spawn")
-    batches: Any = iter(loader)
-    for _ in range(4 * WORKERS):
-        next(batches)
-    pids = [os.getpid(), *(worker.pid for worker in batches._workers)]  # noqa: SLF001
-    start, used, done = time.perf_counter(), processor_time(pids), 0
-    while time.perf_counter() - start < seconds:
-        done += len(next(batches)[0])
-    rate = done / (time.perf_counter() - start)
-    used = processor_time(pids) - used
-    batches._shutdown_workers()  # noqa: SLF001  in the middle of an epoch
-    return rate, used / done
+    file = h5py.File(out, "w")
+    with h5py.File(path) as source:
+        return [
+            file.create_dataset(name, data=source[name][()], chunks=source[name].chunks) for name in NAMES
+        ]
 
 
 def compressions(path: Path, folder: Path) -> None:
@@ -204,7 +143,7 @@ def compressions(path: Path, folder: Path) -> None:
                 )
         write = (time.process_time() - start) / 2
         with h5py.File(out) as file:
-            sets = [file[key] for key in UncompressedShards.names]
+            sets = [file[key] for key in NAMES]
             start = time.process_time()
             for i in range(20):
                 _ = [sets[0][i % 2, i % FRAMES], *(d[i % 2] for d in sets[1:])]
@@ -221,53 +160,43 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="per reader")
     parser.add_argument("--views", type=int, default=8, help="of the synthetic dataset's two scenes")
     args = parser.parse_args()
-    torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         dataset = args.dataset or synthetic_dataset(folder / "dataset", 2, args.views)
         start = time.process_time()
-        pack(dataset, args.split, folder / "cache")
+        cache = pack(dataset, args.split, folder / "cache")
         packing = time.process_time() - start
-        shards = Samples(dataset, args.split)
-        cached = Samples(dataset, args.split, folder / "cache")
-        in_memory = tensors(cached)
-        plain = UncompressedShards(shards, folder / "plain.h5")
-        size = sum(x.nbytes for x in cached[0])
-        files = [scene.path for scene in open_cache(folder / "cache").values()]
-        flat = [np.memmap(path, np.uint8, mode="r") for path in files]
-        spots = np.random.default_rng(1).random(len(cached))
+        entries = load_manifest(dataset).split(args.split)
+        shards = {n: ShardReader(dataset / e.path, e.sha256) for n, e in entries.items()}
+        plain = {n: unfiltered(dataset / e.path, folder / f"{n}.h5") for n, e in entries.items()}
+        every = [(n, v, f) for n, r in shards.items() for v in range(r.views) for f in range(r.frames)]
+        size = sum(a.nbytes for a in sample(cache[every[0][0]], 0, 0))
+        flat = [np.memmap(scene.path, np.uint8, mode="r") for scene in cache.values()]
+        spots = np.random.default_rng(1).random(len(every))
 
         def flat_read(i: int) -> np.ndarray:
             whole = flat[i % len(flat)]
             at = int(spots[i] * (len(whole) - size)) & ~4095
             return np.array(whole[at : at + size])
 
-        views = sum(reader.views for reader in cached.readers.values())
-        print(
-            f"{len(cached)} samples of {views} views, {size / 1e6:.2f} MB each; packed in {packing:.1f} s of CPU"
-        )
-        found = rates(
-            {
-                "flat memory map, same bytes": flat_read,
-                "cache (tofcapture pack)": cached.__getitem__,
-                "shard, as written": shards.__getitem__,
-                "HDF5, same chunks, no filter": plain.__getitem__,
-                "TensorDataset in memory (copied)": lambda i: [x.clone() for x in in_memory[i]],
-            },
-            len(cached),
-            args.seconds,
-        )
+        def plain_read(i: int) -> list[np.ndarray]:
+            scene, view, frame = every[i]
+            raw, *maps = plain[scene]
+            return [raw[view, frame], *(d[view] for d in maps)]
+
+        print(f"{len(every)} samples, {size / 1e6:.2f} MB each; packed in {packing:.1f} s of CPU")
+        readers = {
+            "flat memory map, same bytes": flat_read,
+            "cache (tofcapture pack)": lambda i: sample(cache[every[i][0]], *every[i][1:]),
+            "shard, as written": lambda i: sample(shards[every[i][0]], *every[i][1:]),
+            "HDF5, same chunks, no filter": plain_read,
+        }
+        found = rates(readers, len(every), args.seconds)
         base = found["flat memory map, same bytes"]
         print(f"\n{'one random sample, one process':36} {'samples/s':>10} {'GB/s':>6} {'of flat':>8}")
         for reader, rate in found.items():
             print(f"{reader:36} {rate:10.0f} {rate * size / 1e9:6.2f} {rate / base:8.0%}")
-        print(
-            f"\n{f'DataLoader, {WORKERS} workers, batch {BATCH}':36} {'samples/s':>10} {'CPU ms':>7} {'on 2 free cores':>16}"
-        )
-        for reader, data in (("cache", cached), ("shard", shards), ("TensorDataset", in_memory)):
-            rate, cpu = loader_rate(data, args.seconds)
-            print(f"{reader:36} {rate:10.0f} {1e3 * cpu:7.2f} {2 / cpu:16.0f}", flush=True)
-        compressions(next(iter(shards.readers.values())).path, folder)
+        compressions(next(iter(shards.values())).path, folder)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,7 @@ import numpy as np
 
 from tofcapture.camera import Camera
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
-from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, TofMaps
-from tofcapture.files.shard_writer import ShardWriter
+from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardWriter, TofMaps
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.ops.phase import decode, mean_phasors, taps
 from tofcapture.poses import look_at

@@ -13,11 +13,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.ground_truth import class_errors, crop_shares
 from tests.test_ops_clean import inside
 from tofcapture.cli import main
+from tofcapture.dataset import sample as sampling
 from tofcapture.dataset.build import build_dataset
-from tofcapture.dataset.sample import SampleConfig, assemble, make_sample
-from tofcapture.dataset.truth import class_errors, crop_shares, ground_truth_error
+from tofcapture.dataset.sample import SampleConfig, decoder_for, masked
+from tofcapture.dataset.truth import pooled, view_error
 from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.light import exact_view
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
@@ -68,8 +70,8 @@ def true_rig(view):
     return replace(view.rig, T_tof_stereo=view.truth.T_tof_stereo, T_flange_tof=view.truth.T_flange_tof)
 
 
-def rng():
-    return np.random.default_rng(0)
+def make_sample(view, rig, config=CONFIG, seed=0):
+    return sampling.make_sample(view, rig, config, np.random.default_rng(seed), decoder_for(view, rig))
 
 
 @pytest.fixture(scope="module")
@@ -79,12 +81,12 @@ def view():
 
 @pytest.fixture(scope="module")
 def sample(view):
-    return make_sample(view, true_rig(view), CONFIG, rng())
+    return make_sample(view, true_rig(view))
 
 
 @pytest.fixture(scope="module")
 def fine(view):
-    return make_sample(view, true_rig(view), SampleConfig(scales=(1, 2, 4)), rng())
+    return make_sample(view, true_rig(view), SampleConfig(scales=(1, 2, 4)))
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +104,7 @@ def recording(tmp_path_factory):
 def test_ground_truth_agrees_with_the_truth(scene, distance):
     """With cameras of full size and the true rig, where the mask is 0: median below 0.2 mm, 99 % below 2 mm."""
     seen = simulate(scene, 2, distance, {"render": SMALL["render"]})
-    error = ground_truth_error(seen, true_rig(seen))
+    error = pooled([view_error(make_sample(seen, true_rig(seen)), seen)])
     assert error.median_error_mm <= 0.2
     assert error.p99_error_mm <= 2.0
     assert error.coverage > 0.4
@@ -182,11 +184,10 @@ def test_four_times_agrees_with_the_exact_depth(fine, sample, view):
 
 
 def test_only_known_scales_are_made():
-    """1 and 2 are always there, and nothing but 4 comes beside them; only 4 is told in the digest."""
+    """1 and 2 are always there, and nothing but 4 comes beside them."""
     for scales in ((1, 4), (4, 2, 1), (1, 2, 3), ()):
         with pytest.raises(ConfigError, match="scales"):
             SampleConfig(scales=scales)
-    assert SampleConfig().table() == {"crop_radius": 0.35, "far": 2.0}
     assert SampleConfig(scales=[1, 2, 4]).table()["scales"] == [1, 2, 4]
 
 
@@ -204,7 +205,7 @@ def test_the_sample_carries_the_view(sample, view):
 def test_without_a_crop_nothing_is_outside(view, sample):
     """A radius of a hundred metres keeps the table in, and changes no depth."""
     rig = true_rig(view)
-    whole = make_sample(view, rig, SampleConfig(crop_radius=1000.0), np.random.default_rng(view.index))
+    whole = make_sample(view, rig, SampleConfig(crop_radius=1000.0), view.index)
     for scale in (1, 2):
         assert not (whole.ground_truth[scale].mask & MaskBit.OUTSIDE).any()
         np.testing.assert_array_equal(whole.ground_truth[scale].depth, sample.ground_truth[scale].depth)
@@ -221,7 +222,7 @@ def test_the_mask_is_what_numpy_says(sample, view, with_table):
     crop = table if with_table else replace(table, normal=np.full(3, np.nan), offset=np.nan, radius=np.inf)
     depth, normals = gt.depth.astype(float), gt.normals.astype(float)
     no = np.zeros(camera.shape, dtype=bool)
-    found = assemble(Projection(depth, np.zeros((*camera.shape, 2)), normals, no, no), rig, camera, crop).mask
+    found = masked(Projection(depth, np.zeros((*camera.shape, 2)), normals, no, no), rig, camera, crop).mask
     points = camera.unproject(depth)
     rays = np.stack([points, points - rig.T_tof_stereo[:3, 3]])
     cosine = -(normals * rays).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
@@ -236,7 +237,7 @@ def test_the_mask_is_what_numpy_says(sample, view, with_table):
 
 def test_the_same_inputs_give_the_same_bytes(sample, view):
     """A sample is a function of view, rig, config and generator state."""
-    again = make_sample(view, true_rig(view), CONFIG, rng())
+    again = make_sample(view, true_rig(view))
     for scale in (1, 2):
         for name in ("depth", "normals", "mask"):
             a, b = (getattr(s.ground_truth[scale], name) for s in (sample, again))
@@ -247,7 +248,7 @@ def test_a_rig_of_another_camera_is_refused(view):
     """Sizes that disagree are a data error."""
     wrong = replace(true_rig(view), tof=view.rig.tof.scaled(2))
     with pytest.raises(DataError, match="expected ToF images"):
-        make_sample(view, wrong, CONFIG, rng())
+        make_sample(view, wrong, CONFIG)
 
 
 def test_build_check_and_read(recording, tmp_path):

@@ -7,8 +7,7 @@ import json
 import pytest
 
 from tests.test_files_shard import write
-from tofcapture.dataset.card import write_card
-from tofcapture.dataset.croissant import CONTEXT
+from tofcapture.dataset.card import CONTEXT, write_card
 from tofcapture.files.check import check
 from tofcapture.files.manifest import Manifest, SceneEntry, manifest_path, write_manifest
 from tofcapture.files.seal import sha256_of

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from tests.test_dataset_build import simulate, true_rig
-from tofcapture.dataset.build import Share, build_dataset
+from tofcapture.cli import main
+from tofcapture.dataset.build import build_dataset
 from tofcapture.errors import ConfigError
-from tofcapture.files import shard_writer
+from tofcapture.files import shard as shards
 from tofcapture.files.check import check
 from tofcapture.files.seal import sha256_of
 from tofcapture.files.view import view_path, write_view
@@ -75,23 +76,23 @@ def test_workers_killed_in_the_middle_cost_nothing_but_a_retry(recording, calm, 
 
 def test_handles_that_somebody_holds_do_not_change_the_bytes(recording, calm, tmp_path, monkeypatch):
     """A profiler that keeps datasets open (Dask's does, for moments) does not move what HDF5 allocates."""
-    held, create = [], shard_writer.create
+    held, create = [], shards.create
 
     def keeping(*args):
         held.append(create(*args))
         return held[-1]
 
-    monkeypatch.setattr(shard_writer, "create", keeping)
+    monkeypatch.setattr(shards, "create", keeping)
     build_dataset([recording], tmp_path / "out", jobs=1)
     assert held
     assert_same(tmp_path / "out", calm)
 
 
 def test_parts_of_a_batch_make_the_whole(recording, calm, tmp_path):
-    """Three calls of --shard I/3 in any order: the last to be done writes the manifest, and --finish changes nothing."""
+    """Three calls of --part I/3 in any order: the last to be done writes the manifest, and --finish changes nothing."""
     out = tmp_path / "out"
     for index in (2, 3, 1):
-        result = build_dataset([recording], out, jobs=1, share=Share(index, 3))
+        result = build_dataset([recording], out, jobs=1, part=(index, 3))
         assert bool(result.missing) == (index != 1)
         assert (out / "manifest.json").exists() == (index == 1)
     assert result.scenes == calm.scenes
@@ -115,7 +116,7 @@ def test_what_is_not_there_is_not_finished(recording, tmp_path):
         "--json",
     ]
     part = subprocess.run(
-        [*command, "--jobs", "1", "--shard", "1/5"], capture_output=True, text=True, check=True
+        [*command, "--jobs", "1", "--part", "1/5"], capture_output=True, text=True, check=True
     )
     assert json.loads(part.stdout)["missing"] == list(SCENES[1:])
     done = subprocess.run([*command, "--finish"], capture_output=True, text=True, check=False)
@@ -125,10 +126,11 @@ def test_what_is_not_there_is_not_finished(recording, tmp_path):
 
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "2", "a/b", "-1/3", "1/0"])
-def test_a_share_that_is_none_is_refused(text):
+def test_a_part_that_is_none_is_refused(recording, tmp_path, capsys, text):
     """I/N with 1 <= I <= N, nothing else."""
-    with pytest.raises(ConfigError, match="--shard"):
-        Share.parse(text)
+    assert main(["build-dataset", str(recording), "--out", str(tmp_path / "x"), f"--part={text}"]) == 3
+    assert "--part: expected I/N" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
 
 
 def test_an_engine_that_is_not_there_says_so(recording, tmp_path, monkeypatch):

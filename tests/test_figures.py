@@ -8,14 +8,13 @@ import sys
 import numpy as np
 import pytest
 
-from tests.test_dataset_build import CONFIG, rng, simulate, true_rig
+from tests.test_dataset_build import make_sample, simulate, true_rig
 from tests.test_files_shard import write
 from tofcapture.cli import main
 from tofcapture.colours import percentile, round_up
-from tofcapture.dataset.sample import make_sample
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
-from tofcapture.files.maps import GroundTruth
+from tofcapture.files.shard import GroundTruth
 from tofcapture.files.view import view_path, write_view
 from tofcapture.poses import look_at
 from tofcapture.rig import dumps_rig
@@ -185,7 +184,7 @@ def test_preprocessing_is_what_the_dataset_keeps(view):
     """The denoised cloud is the native ground truth of the sample, and alignment brings the clouds together."""
     rig = true_rig(view)
     steps = preprocess(view, rig)
-    sample = make_sample(view, rig, CONFIG, rng())
+    sample = make_sample(view, rig)
     native = int(np.isfinite(sample.native_depth).sum())
     assert abs(len(steps.kept) - native) <= 0.02 * native
     assert 0 < len(steps.removed) < len(steps.kept)

@@ -1,8 +1,9 @@
-"""Packed splits: the same arrays as the shards, resumed, refused when stale; and the dataset that reads either."""
+"""Packed splits: the same arrays as the shards, resumed, refused when stale, read by spawned workers."""
 
 from __future__ import annotations
 
 import json
+import multiprocessing
 import pickle
 from dataclasses import replace
 
@@ -12,11 +13,9 @@ import pytest
 from tests.test_files_shard import write
 from tofcapture.cli import main
 from tofcapture.errors import DataError, FormatError
-from tofcapture.files import cache as packing
 from tofcapture.files.cache import open_cache, pack, verify_cache
 from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
 from tofcapture.files.shard import ShardReader
-from tofcapture_model.data import FrameDataset, open_scenes
 
 
 def make(folder, scenes=("box", "mug"), split="train"):
@@ -46,43 +45,40 @@ def test_a_cache_holds_what_the_shards_hold(dataset, tmp_path):
                 for frame in range(shard.frames):
                     np.testing.assert_array_equal(scene.raw(view, frame), shard.raw(view, frame))
                     assert scene.celsius(view, frame) == shard.celsius(view, frame)
-                for a, b in zip(
+                pairs = zip(
                     vars(scene.ground_truth(view)).values(),
                     vars(shard.ground_truth(view, 2)).values(),
                     strict=True,
-                ):
+                )
+                for a, b in pairs:
                     np.testing.assert_array_equal(a, b)
-    table = json.loads((tmp_path / "cache/index.json").read_text())["scenes"]["mug"]["dtype"]
-    dtype = np.dtype({**table, "formats": [(f, tuple(s)) for f, s in table["formats"]]})
+    fields = json.loads((tmp_path / "cache/index.json").read_text())["scenes"]["mug"]["fields"]
+    dtype = np.dtype([(n, f, tuple(s)) for n, f, s in fields], align=True)
     plain = np.memmap(tmp_path / "cache/mug.bin", dtype, mode="r")
     np.testing.assert_array_equal(plain["raw"][1, 2], scenes["mug"].raw(1, 2))
     with pytest.raises(ValueError, match="read-only"):
         scenes["mug"].raw(0, 0)[:] = 0
 
 
-def test_packing_goes_on_where_it_was_killed(dataset, tmp_path, monkeypatch):
+def test_packing_goes_on_where_it_was_killed(dataset, tmp_path):
     """After a kill the finished scene is kept, to the file, and the result is that of an unbroken run."""
+    cache = tmp_path / "cache"
     pack(dataset, "train", tmp_path / "whole")
-    real, packed = packing._pack_scene, []
 
-    def dies_at_mug(path, *args):
-        packed.append(path.stem)
-        if path.stem == "mug":
+    def dies_at_mug(scene, _view, _views):
+        if scene == "mug":
             raise KeyboardInterrupt
-        return real(path, *args)
 
-    monkeypatch.setattr(packing, "_pack_scene", dies_at_mug)
     with pytest.raises(KeyboardInterrupt):
-        pack(dataset, "train", tmp_path / "cache")
+        pack(dataset, "train", cache, dies_at_mug)
+    assert sorted(p.name for p in cache.iterdir()) == ["box.bin", "index.json"]
     with pytest.raises(DataError, match="stale: mug"):
-        open_cache(tmp_path / "cache", dataset)
-    monkeypatch.setattr(
-        packing, "_pack_scene", lambda path, *args: packed.append(path.stem) or real(path, *args)
-    )
-    pack(dataset, "train", tmp_path / "cache")
-    assert packed == ["box", "mug", "mug"]
+        open_cache(cache, dataset)
+    packed = set()
+    pack(dataset, "train", cache, lambda scene, _view, _views: packed.add(scene))
+    assert packed == {"mug"}
     for name in ("box.bin", "mug.bin", "index.json"):
-        assert (tmp_path / "cache" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+        assert (cache / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
 def test_a_stale_cache_is_refused_and_brought_up_to_date(dataset, tmp_path):
@@ -91,11 +87,11 @@ def test_a_stale_cache_is_refused_and_brought_up_to_date(dataset, tmp_path):
     pack(dataset, "train", cache)
     make(dataset, ("mug", "gear"))
     with pytest.raises(DataError, match=r"stale: box, gear, mug changed") as info:
-        FrameDataset(dataset, "train", cache=cache)
+        open_cache(cache, dataset)
     assert "tofcapture pack" in info.value.hint
     assert list(pack(dataset, "train", cache)) == ["gear", "mug"]
     assert sorted(p.name for p in cache.iterdir()) == ["gear.bin", "index.json", "mug.bin"]
-    assert len(FrameDataset(dataset, "train", cache=cache)) == 12
+    assert list(open_cache(cache, dataset)) == ["gear", "mug"]
 
 
 def test_damage_is_named(dataset, tmp_path):
@@ -107,6 +103,8 @@ def test_damage_is_named(dataset, tmp_path):
     data[100] ^= 1
     scenes["mug"].path.write_bytes(data)
     assert verify_cache(cache) == ["mug"]
+    with pytest.raises(DataError, match="changed after it was sealed"):
+        open_cache(cache, dataset)["mug"].raw(0, 0)
     scenes["mug"].path.write_bytes(data[:-1])
     with pytest.raises(DataError, match=r"expected \d+ bytes"):
         open_cache(cache, dataset)["mug"].raw(0, 0)
@@ -119,12 +117,10 @@ def test_damage_is_named(dataset, tmp_path):
     with pytest.raises(DataError, match="'val' is empty"):
         pack(dataset, "val", cache)
     manifest = load_manifest(dataset)
-    moved = {k: replace(e, split="val") for k, e in manifest.scenes.items()}
-    write_manifest(dataset, Manifest(moved))
+    write_manifest(dataset, Manifest({k: replace(e, split="val") for k, e in manifest.scenes.items()}))
     with pytest.raises(FormatError, match="of the split 'val'"):
         pack(dataset, "val", cache)
-    wrong = replace(manifest.scenes["mug"], sha256="0" * 64)
-    write_manifest(dataset, Manifest({"mug": wrong}))
+    write_manifest(dataset, Manifest({"mug": replace(manifest.scenes["mug"], sha256="0" * 64)}))
     with pytest.raises(DataError, match="not the shard of the manifest"):
         pack(dataset, "train", tmp_path / "other")
     for text in ("{", "[]", '{"format": "tofcapture-cache", "version": 1}'):
@@ -141,19 +137,20 @@ def test_the_command_packs(dataset, tmp_path, capsys):
         assert json.loads(capsys.readouterr().out)["packed"] == packed
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_training_reads_the_same_arrays_of_shards_and_of_a_cache(dataset, tmp_path, packed):
-    """Readers in use pickle, as workers need it, and open their files again after a close."""
-    cache = pack(dataset, "train", tmp_path / "cache") and tmp_path / "cache"
-    used = open_scenes(dataset, "train", cache if packed else None)
-    assert len(FrameDataset(dataset, "train", cache=cache if packed else None)) == 12
-    assert len(FrameDataset(dataset, "train", cache=cache if packed else None, frames=1)) == 4
-    with ShardReader(dataset / "shards/mug.h5") as shard:
-        for _ in range(2):
-            for reader in (used["mug"], pickle.loads(pickle.dumps(used["mug"]))):  # noqa: S301
-                np.testing.assert_array_equal(reader.raw(1, 1), shard.raw(1, 1))
-                np.testing.assert_array_equal(
-                    reader.ground_truth(1, 2).normals, shard.ground_truth(1, 2).normals
-                )
-                assert reader.celsius(1, 1) == shard.celsius(1, 1)
-                reader.close()
+def read_all(reader):
+    """Every frame of a reader; runs in a spawned process."""
+    return np.stack([reader.raw(v, f) for v in range(reader.views) for f in range(reader.frames)])
+
+
+def test_a_reader_in_use_goes_to_a_spawned_worker(dataset, tmp_path):
+    """Shards and caches that were read from here pickle, and give the same there."""
+    packed, shard = pack(dataset, "train", tmp_path / "cache")["mug"], ShardReader(dataset / "shards/mug.h5")
+    expected = read_all(shard)
+    assert (read_all(packed) == expected).all()
+    assert (read_all(pickle.loads(pickle.dumps(packed))) == expected).all()  # noqa: S301
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        for found in pool.map(read_all, [shard, packed]):
+            assert (found == expected).all()
+    packed.close()
+    assert (read_all(packed) == expected).all()
+    shard.close()

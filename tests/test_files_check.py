@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import shutil
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,11 +16,8 @@ import pytest
 
 from tests.sealed import delete, edit, replaced, reseal, set_array, set_attr, simulate
 from tests.test_files_shard import write
-from tofcapture.errors import DataError
-from tofcapture.files import seal as sealing
 from tofcapture.files.check import check
 from tofcapture.files.seal import digest_path
-from tofcapture.files.shard import ShardReader
 from tofcapture.files.view import write_view
 
 
@@ -220,28 +215,3 @@ def test_random_damage_is_reported_and_never_read(tmp_path):
     assert (result["corruptions"], result["reported"]) == (60, 60)
     assert set(result["reads"]) == {"right", "named error"}, result
     assert result["reads"]["named error"] > 40
-
-
-def test_a_reader_hashes_a_file_once(here, monkeypatch):
-    """A file that nobody touches is hashed once per process, and not in a process that a reader is sent to; a changed one is."""
-    path = here / "dataset/shards/box.h5"
-    later = time.time() + 60
-    monkeypatch.setattr(sealing.time, "time", lambda: later)
-    hashed = []
-    real = sealing.sha256_of
-    monkeypatch.setattr(sealing, "sha256_of", lambda p: hashed.append(p) or real(p))
-    for _ in range(2):
-        with ShardReader(path) as shard:
-            assert shard.views == 1
-    assert hashed == [path]
-    sent = pickle.dumps(ShardReader(path))
-    monkeypatch.setattr(sealing, "_digests", {})
-    assert pickle.loads(sent).views == 1  # noqa: S301
-    assert hashed == [path]
-    data = bytearray(path.read_bytes())
-    data[-1] ^= 1
-    path.chmod(0o644)
-    path.write_bytes(data)
-    with pytest.raises(DataError, match="sha256"):
-        ShardReader(path).views  # noqa: B018
-    assert hashed == [path, path]

@@ -12,7 +12,6 @@ from tests.sealed import edit, set_array, set_attr
 from tofcapture.files.cache import pack
 from tofcapture.files.check import check
 from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
-from tofcapture.files.migrate import migrate
 from tofcapture.files.seal import sha256_of
 
 
@@ -131,16 +130,3 @@ def test_strays_and_stale_caches_are_found(here):
     box = replace(manifest.scenes["box"], sha256=sha256_of(dataset / "shards/box.h5"))
     write_manifest(dataset, replace(manifest, scenes={**manifest.scenes, "box": box}))
     assert any("stale: box" in p.message for p in check(dataset))
-
-
-def test_a_manifest_of_the_first_version(here):
-    """It is read as it was; check says that it does not vouch for itself; migrate signs it."""
-    dataset = here / "dataset"
-    path = dataset / "manifest.json"
-    manifest, table = load_manifest(dataset), json.loads(path.read_text())
-    del table["sha256"]
-    path.write_text(json.dumps({**table, "version": 1}, indent=1, sort_keys=True) + "\n")
-    assert load_manifest(dataset) == manifest
-    assert [p.hint.split()[1] for p in check(dataset) if p.path.name == "manifest.json"] == ["migrate"]
-    migrate(dataset)
-    assert check(dataset) == []

@@ -22,8 +22,7 @@ from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, write_manifest
 from tofcapture.files.seal import sha256_of
-from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, TofMaps
-from tofcapture.files.shard_writer import ShardWriter
+from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardWriter, TofMaps
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.ops.phase import taps
 from tofcapture.poses import look_at
@@ -34,7 +33,7 @@ from tofcapture_model.networks.checkpoint import save_model
 from tofcapture_model.report import write_report
 from tofcapture_model.report.content import loss_curve, origin_of
 from tofcapture_model.report.examples import choose
-from tofcapture_model.report.scores import headline, method_title, tables, tiles
+from tofcapture_model.report.scores import POOLS, headline, tables, tiles
 from tofcapture_model.training import read_metrics
 
 CAMERA = Camera(64, 48, 50.0, 52.0, 31.0, 24.5)
@@ -440,10 +439,10 @@ def test_better_value_is_marked():
     """Less is better for errors, more for shares, nearer to zero for the bias; equal print is no win."""
     results = results_table()
     results["methods"]["sensor"]["depth"]["pixel"]["bias"] = -0.0001
-    rows = {row.words: row.cells for table in tables(results) for row in table.rows}
-    assert [c.best for c in rows["MAE (mean absolute error)"]] == [False, True, False, True]
-    assert [c.best for c in rows["mean signed error"]][:2] == [True, False]
-    assert not any(c.best for c in rows["within 10 mm"])
+    rows = {words: [best for _, best in cells] for table in tables(results) for words, cells in table.rows}
+    assert rows["MAE (mean absolute error), mm"] == [False, True, False, True]
+    assert rows["mean signed error, mm"][:2] == [True, False]
+    assert not any(rows["within 10 mm, %"])
 
 
 def test_headline_says_when_the_network_is_worse():
@@ -503,13 +502,12 @@ def test_views_are_taken_evenly():
     assert choose(manifest, "val", 3) == []
 
 
-UNITS = {"mm": 1000, "%": 100}
 METRICS = {
-    "MAE (mean absolute error)": "mae",
-    "median absolute error": "median",
-    "RMSE (root mean square)": "rmse",
-    "mean signed error": "bias",
-    "within 10 mm": "within_10mm",
+    "MAE (mean absolute error), mm": ("mae", 1000),
+    "median absolute error, mm": ("median", 1000),
+    "RMSE (root mean square), mm": ("rmse", 1000),
+    "mean signed error, mm": ("bias", 1000),
+    "within 10 mm, %": ("within_10mm", 100),
 }
 
 
@@ -519,14 +517,14 @@ def test_pools_stand_over_their_numbers():
     depth = results["methods"]["model"]["depth"]
     depth["image"] = {key: 1.5 * value for key, value in depth["pixel"].items()}
     table = tables(results)[0]
-    heads = [words for words, methods in table.pools for _ in range(methods)]
-    at = [k for k, name in enumerate(table.methods) if name == method_title("model")]
-    assert [heads[k] for k in at] == ["all pixels pooled", "mean over images"]
-    assert [row.words for row in table.rows] == list(METRICS)
-    for row in table.rows:
-        for k, pool in zip(at, ("pixel", "image"), strict=True):
-            value = UNITS[row.unit] * depth[pool][METRICS[row.words]]
-            assert float(row.cells[k].text) == pytest.approx(value, abs=0.005)
+    assert list(POOLS) == ["pixel", "image"]
+    at = table.methods.index("network")
+    assert [words for words, _ in table.rows] == list(METRICS)
+    for words, cells in table.rows:
+        key, factor = METRICS[words]
+        for k, pool in enumerate(POOLS):
+            text, _ = cells[k * len(table.methods) + at]
+            assert float(text) == pytest.approx(factor * depth[pool][key], abs=0.005)
 
 
 def test_tiles_show_what_they_say():

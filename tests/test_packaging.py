@@ -224,7 +224,6 @@ CASES = {
     "missing device": (_missing_device, (3, 4), "tof|port|serial"),
     "unknown driver": (_unknown_driver, 3, "robbie"),
     "newer format": (lambda p: _other_version(p, 99), 5, "version"),
-    "older format": (lambda p: _other_version(p, 0), 5, "version"),
     "no permission": (
         lambda p: ["record", "--scene", "mug", "--views", "1", "--out", "/proc/nowhere/rec"],
         (1, 3, 4, 5),

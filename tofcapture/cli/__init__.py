@@ -33,7 +33,6 @@ ORDER = (
     "calibrate",
     "build-dataset",
     "check",
-    "migrate",
     "stats",
     "view",
     "figure",

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tofcapture.cli.kit import progress
 from tofcapture.command import Command, Outcome
 from tofcapture.errors import ConfigError
 
 if TYPE_CHECKING:
     from tofcapture.dataset.build import BuildResult
-
-_EVERY = 5.0  # s between lines of progress
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -49,37 +47,17 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="of a Dask cluster, for example tcp://host:8786"
     )
-    share = parser.add_mutually_exclusive_group()
-    share.add_argument(
-        "--shard",
+    batch = parser.add_mutually_exclusive_group()
+    batch.add_argument(
+        "--part",
         metavar="I/N",
         help="build only part I of N of the scenes; the last part to be done finishes the dataset",
     )
-    share.add_argument(
+    batch.add_argument(
         "--finish",
         action="store_true",
         help="build nothing, write manifest and card of the shards that are there",
     )
-
-
-class _Lines:
-    """Plain lines of progress with an ETA, now and then; on a terminal the line is rewritten each time."""
-
-    def __init__(self, total: int) -> None:
-        self._total, self._done = total, dict[str, int]()
-        self._start = self._last = time.monotonic()
-
-    def __call__(self, scene: str, done: int, views: int) -> None:
-        self._done[scene] = done
-        now = time.monotonic()
-        if not (sys.stderr.isatty() or now - self._last > _EVERY):
-            return
-        self._last = now
-        views_done = sum(self._done.values())
-        eta = (now - self._start) / max(1, views_done) * max(0, self._total - views_done)
-        end = "\r" if sys.stderr.isatty() and done < views else "\n"
-        line = f"{scene}: view {done} of {views}, {views_done} of {self._total} in all, ETA {eta:.0f} s"
-        print(f"{line:<78}", end=end, file=sys.stderr, flush=True)
 
 
 def _positive(value: float | None, name: str) -> dict[str, Any]:
@@ -90,9 +68,18 @@ def _positive(value: float | None, name: str) -> dict[str, Any]:
     return {name: value}
 
 
+def _part(text: str | None) -> tuple[int, int] | None:
+    """Read ``2/8``."""
+    if text is None:
+        return None
+    index, _, count = text.partition("/")
+    if not (index.isdecimal() and count.isdecimal()):
+        raise ConfigError(f"--part: expected I/N with 1 <= I <= N, got {text!r}", hint="--part 2/8")
+    return int(index), int(count)
+
+
 def _run(args: argparse.Namespace) -> Outcome:
-    from tofcapture.dataset.build import Share, build_dataset
-    from tofcapture.dataset.recordings import find_scenes
+    from tofcapture.dataset.build import build_dataset, find_scenes
     from tofcapture.dataset.sample import SCALES, SampleConfig
 
     config = SampleConfig(
@@ -103,20 +90,27 @@ def _run(args: argparse.Namespace) -> Outcome:
     _positive(args.jobs, "jobs")
     start = time.monotonic()
     total = sum(len(views) for _, views in find_scenes(args.recordings).values())
-    result = build_dataset(
-        args.recordings,
-        args.out,
-        args.rig,
-        true_rig=args.true_rig,
-        config=config,
-        jobs=args.jobs,
-        progress=_Lines(total),
-        engine=args.engine,
-        scheduler=args.scheduler,
-        share=None if args.shard is None else Share.parse(args.shard),
-        finish=args.finish,
-    )
-    return _outcome(result, time.monotonic() - start, complete=args.shard is None)
+    done: dict[str, int] = {}
+    with progress() as report:
+
+        def tell(scene: str, view: int, views: int) -> None:
+            done[scene] = view
+            report("build", sum(done.values()), total, f"{scene}: view {view} of {views}")
+
+        result = build_dataset(
+            args.recordings,
+            args.out,
+            args.rig,
+            true_rig=args.true_rig,
+            config=config,
+            jobs=args.jobs,
+            progress=tell,
+            engine=args.engine,
+            scheduler=args.scheduler,
+            part=_part(args.part),
+            finish=args.finish,
+        )
+    return _outcome(result, time.monotonic() - start, complete=args.part is None)
 
 
 def _outcome(result: BuildResult, seconds: float, *, complete: bool) -> Outcome:

@@ -1,30 +1,38 @@
 """From recordings to a dataset: one shard per scene, then the manifest and the card.
 
 Every shard is a function of its views, the rig, the config and this package's version; their digest is stored in it. A run
-skips shards whose digest is right, so a run that was killed goes on where it was, and ends with the same bytes.
+skips shards whose digest is right, so a run that was killed goes on where it was, and ends with the same bytes. So does one
+whose scenes other processes, a Dask cluster or other calls of a batch system built.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from tofcapture.dataset.card import write_card
-from tofcapture.dataset.engines import Progress, run
-from tofcapture.dataset.recordings import find_scenes, rig_for
 from tofcapture.dataset.sample import SampleConfig
-from tofcapture.dataset.shard_task import WORK, SceneOutcome, SceneTask, look, versions
+from tofcapture.dataset.scene import WORK, SceneOutcome, SceneTask, build_scene, versions
 from tofcapture.dataset.split import assign_splits
 from tofcapture.dataset.truth import TruthError, pooled_error
-from tofcapture.errors import ConfigError, TofError
+from tofcapture.errors import ConfigError, DataError, TofError
+from tofcapture.files.layout import BOARD_SCENE
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
 from tofcapture.files.seal import PARTIAL
 from tofcapture.files.shard import ShardReader
+from tofcapture.files.view import read_depth_view
+from tofcapture.pool import RETRIES, Pool
+from tofcapture.rig import Rig, load_rig
+
+Progress = Callable[[str, int, int], None]
+"""Called with a scene, its views that are finished, its views in all."""
+ENGINES = ("process", "dask")
+_CONNECT = 10.0  # s
 
 
 @dataclass(frozen=True)
@@ -61,54 +69,6 @@ class BuildResult:
     peak_memory: int
 
 
-@dataclass(frozen=True)
-class Share:
-    """The part of a build that one call of a batch system does: ``index`` of ``count``, from 1."""
-
-    index: int
-    count: int
-
-    @classmethod
-    def parse(cls, text: str) -> Share:
-        """Read ``2/8``; :class:`ConfigError` for anything else."""
-        index, _, count = text.partition("/")
-        if not (index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count)):
-            raise ConfigError(f"--shard: expected I/N with 1 <= I <= N, got {text!r}", hint="--shard 2/8")
-        return cls(int(index), int(count))
-
-
-def default_jobs() -> int:
-    """One process for each core that this one may use, at most four."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(4, cores)
-
-
-def scene_tasks(
-    recordings: Sequence[Path],
-    out: Path,
-    rig_path: Path | None = None,
-    *,
-    true_rig: bool = False,
-    config: SampleConfig | None = None,
-) -> list[SceneTask]:
-    """One task for each scene, sorted by name; paths are absolute, for workers elsewhere. As for :func:`build_dataset`."""
-    config = config or SampleConfig()
-    out = Path(out).absolute()
-    found = find_scenes([Path(r).absolute() for r in recordings])
-    return [
-        SceneTask(
-            scene,
-            views,
-            rig_for(
-                recording, views[0], None if rig_path is None else rig_path.absolute(), true_rig=true_rig
-            ),
-            config,
-            out / "shards" / f"{scene}.h5",
-        )
-        for scene, (recording, views) in sorted(found.items())
-    ]
-
-
 def build_dataset(
     recordings: Sequence[Path],
     out: Path,
@@ -120,7 +80,7 @@ def build_dataset(
     progress: Progress | None = None,
     engine: str = "process",
     scheduler: str | None = None,
-    share: Share | None = None,
+    part: tuple[int, int] | None = None,
     finish: bool = False,
 ) -> BuildResult:
     """Build or complete a dataset.
@@ -143,8 +103,8 @@ def build_dataset(
         Told after each view, or each scene.
     engine, scheduler
         ``process``, or ``dask`` with the address of a scheduler.
-    share
-        Build only this part of the scenes; the call that finds all shards in place finishes the dataset.
+    part
+        ``(2, 8)``: build the second eighth of the scenes only. The call that finds all shards in place finishes the dataset.
     finish
         Build nothing, finish the dataset from the shards that are there.
 
@@ -156,19 +116,168 @@ def build_dataset(
     Raises
     ------
     ConfigError
-        No rig, a scene that is in two recordings, or an engine that is not there.
+        No rig, a scene that is in two recordings, a part that is none, or an engine that is not there.
     DataError
         No scenes.
     """
-    config = config or SampleConfig()
-    out = Path(out)
+    config, out = config or SampleConfig(), Path(out)
+    index, count = part or (1, 1)
+    if not 1 <= index <= count:
+        raise ConfigError(f"--part: expected I/N with 1 <= I <= N, got {index}/{count}", hint="--part 2/8")
     tasks = scene_tasks(recordings, out, rig_path, true_rig=true_rig, config=config)
-    mine = [] if finish else tasks[share.index - 1 :: share.count] if share else tasks
-    outcomes = dict(run(mine, engine, default_jobs() if jobs is None else jobs, scheduler, progress))
+    mine = [] if finish else tasks[index - 1 :: count]
+    outcomes = _run(mine, engine, default_jobs() if jobs is None else jobs, scheduler, progress)
     others = [t for t in tasks if t.scene not in outcomes]
     if finish or all(t.path.is_file() for t in others):
-        outcomes |= {t.scene: look(t) for t in others}
-    return _result(out, tasks, outcomes, config, whole=share is None and not finish)
+        outcomes |= {t.scene: build_scene(t, only_look=True) for t in others}
+    return _result(out, tasks, outcomes, config, whole=part is None and not finish)
+
+
+def default_jobs() -> int:
+    """Return one process for each core that this one may use, at most four."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(4, cores)
+
+
+def scene_tasks(
+    recordings: Sequence[Path],
+    out: Path,
+    rig_path: Path | None = None,
+    *,
+    true_rig: bool = False,
+    config: SampleConfig | None = None,
+) -> list[SceneTask]:
+    """List one task for each scene, by name; paths are absolute, for workers elsewhere. As for :func:`build_dataset`."""
+    shards = Path(out).absolute() / "shards"
+    chosen = None if rig_path is None else Path(rig_path).absolute()
+    return [
+        SceneTask(
+            scene,
+            views,
+            _rig_for(recording, views[0], chosen, true_rig=true_rig),
+            config or SampleConfig(),
+            shards / f"{scene}.h5",
+        )
+        for scene, (recording, views) in sorted(find_scenes([Path(r).absolute() for r in recordings]).items())
+    ]
+
+
+def find_scenes(recordings: Sequence[Path]) -> dict[str, tuple[Path, tuple[Path, ...]]]:
+    """Find the view files by scene: ``(recording, views in order)``, without the board's.
+
+    Raises
+    ------
+    DataError
+        A recording does not exist or holds no scene.
+    ConfigError
+        Two recordings hold the same scene.
+    """
+    found: dict[str, tuple[Path, tuple[Path, ...]]] = {}
+    for recording in recordings:
+        folder = Path(recording) / "views"
+        if not folder.is_dir():
+            raise DataError(
+                f"{recording}: expected a recording with a folder 'views'",
+                hint="tofcapture record --scene NAME",
+            )
+        for scene in sorted(p for p in folder.iterdir() if p.is_dir() and p.name != BOARD_SCENE):
+            if scene.name in found:
+                raise ConfigError(
+                    f"scene {scene.name} is in {found[scene.name][0]} and in {recording}",
+                    hint="rename one of them",
+                )
+            views = tuple(sorted(scene.glob("view-*.h5")))
+            if views:
+                found[scene.name] = (Path(recording), views)
+    if not found:
+        raise DataError(
+            f"no scene in {', '.join(map(str, recordings))}",
+            hint="tofcapture record --scene NAME --out RECORDING",
+        )
+    return found
+
+
+def _rig_for(recording: Path, first_view: Path, rig_path: Path | None, *, true_rig: bool) -> Rig:
+    """Rig to build with: the given one, the simulator's, or the one that ``align`` wrote."""
+    if true_rig:
+        view, _ = read_depth_view(first_view)
+        if view.truth is None:
+            raise ConfigError(
+                f"{first_view}: carries no true rig", hint="--true-rig is for simulated recordings"
+            )
+        return replace(view.rig, T_tof_stereo=view.truth.T_tof_stereo, T_flange_tof=view.truth.T_flange_tof)
+    path = rig_path or recording / "rig.toml"
+    if not path.is_file():
+        raise ConfigError(
+            f"{path}: expected the calibrated rig, found none", hint=f"tofcapture align {recording}"
+        )
+    return load_rig(path)
+
+
+def _run(
+    tasks: Sequence[SceneTask], engine: str, jobs: int, scheduler: str | None, progress: Progress | None
+) -> dict[str, SceneOutcome]:
+    """Do the tasks with a named engine; outcomes by scene."""
+    if engine not in ENGINES:
+        raise ConfigError(f"--engine: expected {' or '.join(ENGINES)}, got {engine!r}")
+    if (engine == "dask") != (scheduler is not None):
+        raise ConfigError("expected --scheduler with --engine dask, and only there", hint="tcp://HOST:8786")
+    tell = progress or (lambda _scene, _done, _views: None)
+    if scheduler is not None:
+        return _run_dask(tasks, scheduler, tell)
+    return _run_processes(tasks, jobs, tell)
+
+
+def _run_processes(tasks: Sequence[SceneTask], jobs: int, tell: Progress) -> dict[str, SceneOutcome]:
+    """Do the tasks on this machine.
+
+    As many scenes as can be shared out evenly are one task each. The views of those that remain, the smallest, are spread over
+    all processes.
+    """
+
+    def alone(task: SceneTask, pool: Pool | None) -> SceneOutcome:
+        return build_scene(task, pool, lambda done: tell(task.scene, done, len(task.views)))
+
+    if jobs <= 1:
+        return {t.scene: alone(t, None) for t in tasks}
+    order = sorted(tasks, key=lambda t: (-len(t.views), t.scene))
+    whole = len(order) - len(order) % jobs
+    out: dict[str, SceneOutcome] = {}
+    with Pool(jobs) as pool:
+        for index, outcome in pool.run(build_scene, [(t,) for t in order[:whole]]):
+            task = order[index]
+            out[task.scene] = SceneOutcome(error=outcome) if isinstance(outcome, TofError) else outcome
+            tell(task.scene, len(task.views), len(task.views))
+        return out | {t.scene: alone(t, pool) for t in order[whole:]}
+
+
+def _run_dask(tasks: Sequence[SceneTask], scheduler: str, tell: Progress) -> dict[str, SceneOutcome]:
+    """Do the tasks on a Dask cluster whose workers see the same folders under the same names."""
+    try:
+        from distributed import Client, as_completed
+    except ImportError as err:
+        raise ConfigError(
+            f"--engine dask: distributed does not load: {err}", hint="pip install 'tofcapture[cluster]'"
+        ) from err
+    try:
+        client = Client(scheduler, timeout=_CONNECT, set_as_default=False)
+    except (OSError, ValueError) as err:
+        raise DataError(
+            f"--scheduler {scheduler}: expected a Dask scheduler there, got {err or 'no answer'}",
+            hint="dask scheduler; dask worker tcp://HOST:8786 --nthreads 1",
+        ) from err
+    out: dict[str, SceneOutcome] = {}
+    with client:
+        futures = {client.submit(build_scene, t, pure=False, retries=RETRIES): t for t in tasks}
+        for future in as_completed(list(futures), loop=client.loop):
+            task, error = futures[future], future.exception()
+            if error is None:
+                out[task.scene] = future.result()
+            else:  # its workers died, or it met something nobody foresaw
+                message = f"{task.scene}: {type(error).__name__}: {error}"
+                out[task.scene] = SceneOutcome(error=TofError(message, "see the worker's log"))
+            tell(task.scene, len(task.views), len(task.views))
+    return out
 
 
 def _result(
@@ -179,42 +288,36 @@ def _result(
     *,
     whole: bool,
 ) -> BuildResult:
-    there = {t.scene: t.path for t in tasks if outcomes.get(t.scene, SceneOutcome(None)).sha256}
-    known = {scene: _provenance(path) for scene, path in there.items()}
-    splits = assign_splits((t.scene for t in tasks), {scene: _objects(p) for scene, p in known.items()})
-    entries: dict[str, SceneEntry] = {}
-    failures: dict[str, TofError] = {}
-    for task in tasks:
-        outcome = outcomes.get(task.scene, SceneOutcome(None))
-        if outcome.error is not None:
-            failures[task.scene] = outcome.error
-        elif outcome.sha256 is not None:
-            entries[task.scene] = SceneEntry(
-                f"shards/{task.scene}.h5", outcome.sha256, len(task.views), splits[task.scene]
-            )
+    there = {t.scene: t for t in tasks if t.scene in outcomes and outcomes[t.scene].sha256}
+    known = {scene: _provenance(t.path) for scene, t in there.items()}
+    objects = {scene: [str(name) for name in p.get("objects") or ()] for scene, p in known.items()}
+    splits = assign_splits((t.scene for t in tasks), objects)
+    entries = {
+        scene: SceneEntry(f"shards/{scene}.h5", str(outcomes[scene].sha256), len(t.views), splits[scene])
+        for scene, t in there.items()
+    }
+    failures = {scene: o.error for scene, o in outcomes.items() if o.error is not None}
     missing = tuple(t.scene for t in tasks if t.scene not in entries and t.scene not in failures)
-    gt = None
-    if not missing and (whole or not failures):
-        gt = _finish(out, entries, config)
-    skipped = tuple(scene for scene, o in sorted(outcomes.items()) if o.skipped)
-    peak = max((o.peak_memory for o in outcomes.values()), default=0)
-    bare = {scene: names for scene, p in known.items() if (names := _bare(p))}
-    return BuildResult(out, entries, skipped, failures, bare, missing, gt, peak)
+    complete = not missing and (whole or not failures)
+    bare = {
+        scene: tuple(view["name"] for view in p["views"] if view["good_pixels"] == 0)
+        for scene, p in known.items()
+    }
+    return BuildResult(
+        dataset=out,
+        scenes=entries,
+        skipped=tuple(scene for scene, o in sorted(outcomes.items()) if o.skipped),
+        failures=dict(sorted(failures.items())),
+        bare={scene: names for scene, names in bare.items() if names},
+        missing=missing,
+        gt=_finish(out, entries, config) if complete else None,
+        peak_memory=max((o.peak_memory for o in outcomes.values()), default=0),
+    )
 
 
 def _provenance(shard: Path) -> Mapping[str, Any]:
     with ShardReader(shard) as reader:
         return reader.provenance
-
-
-def _objects(provenance: Mapping[str, Any]) -> list[str]:
-    """Objects that a shard says it shows; none when it does not know."""
-    return [str(name) for name in provenance.get("objects") or ()]
-
-
-def _bare(provenance: Mapping[str, Any]) -> tuple[str, ...]:
-    """Names of a shard's views without good ground truth."""
-    return tuple(view["name"] for view in provenance.get("views", ()) if view["good_pixels"] == 0)
 
 
 @contextmanager

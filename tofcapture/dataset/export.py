@@ -5,30 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from tofcapture.dataset.export_mcap import export_mcap
-from tofcapture.dataset.export_ply import export_ply
-from tofcapture.dataset.export_png import export_png
-from tofcapture.errors import ConfigError, DataError, FormatError
-from tofcapture.files.manifest import load_manifest
+from tofcapture.dataset.exporters import export_mcap, export_ply, export_png
+from tofcapture.errors import ConfigError, FormatError
+from tofcapture.files.manifest import load_manifest, load_signed, signed_text
 from tofcapture.files.seal import sealed_digest, sha256_of, write_text
 from tofcapture.files.shard import ShardReader
-from tofcapture.files.signed import parse_signed, signed_text
 
 FORMAT, VERSION = "tofcapture-export", 1
 INDEX = "export.json"
 UNIT = 1 / 8000  # m, of PNG depth: 8.19 m, which holds the 7.5 m that 20 MHz measures; 0.1 mm would not
 _AGAIN = "choose another --out, or delete it"
-
-
-class Exporter(Protocol):
-    """Writes one scene below a folder; returns its files."""
-
-    def __call__(self, shard: ShardReader, folder: Path, unit: float) -> list[Path]:
-        """Write the scene."""
-
-
+Exporter = Callable[[ShardReader, Path, float], list[Path]]
+"""Writes one scene below a folder, PNG depth in steps of so many metres; returns its files."""
 EXPORTERS: Mapping[str, Exporter] = {"ply": export_ply, "png16": export_png, "mcap": export_mcap}
 
 
@@ -89,7 +79,7 @@ def export(
             f"expected a format of {', '.join(EXPORTERS)} and a positive unit, got {kind}, {unit}"
         )
     out, shards = Path(out), _shards(Path(path))
-    index = _begun(out, kind, unit)
+    index = _begun(out / INDEX, kind, unit)
     written = []
     for done, (scene, (shard_path, promised)) in enumerate(sorted(shards.items())):
         digest = promised or sealed_digest(shard_path)
@@ -113,13 +103,11 @@ def _shards(path: Path) -> dict[str, tuple[Path, str | None]]:
         return {shard.scene: (path, None)}
 
 
-def _begun(out: Path, kind: str, unit: float) -> dict[str, Any]:
+def _begun(path: Path, kind: str, unit: float) -> dict[str, Any]:
     wanted = {"format": FORMAT, "version": VERSION, "kind": kind, "unit": unit}
-    path = out / INDEX
     if not path.exists():
-        out.mkdir(parents=True, exist_ok=True)
         return {**wanted, "scenes": {}}
-    index = parse_signed(path.read_bytes(), str(path), _AGAIN)
+    index = load_signed(path, "export's index", (FORMAT, VERSION), _AGAIN)
     found = {name: index.get(name) for name in wanted}
     if found != wanted:
         raise FormatError(f"{path}: expected {wanted}, got {found}", hint=_AGAIN)
@@ -141,11 +129,3 @@ def _whole(out: Path, known: Mapping[str, Any] | None, digest: str) -> bool:
         (out / name).is_file() and sha256_of(out / name) == entry["sha256"]
         for name, entry in known["files"].items()
     )
-
-
-def check_export(out: Path) -> None:
-    """Raise :class:`DataError` when a file of an export is missing or not the one that was written."""
-    index = parse_signed((out / INDEX).read_bytes(), str(out / INDEX), _AGAIN)
-    for scene, known in index["scenes"].items():
-        if not _whole(out, known, known["shard_sha256"]):
-            raise DataError(f"{out}: files of {scene} are missing or changed", hint="export again")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import threading
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,22 +10,21 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
-from tofcapture.files.hdf import dumps
-from tofcapture.files.info import tof_from, tof_table
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, TofMaps
-from tofcapture.frames import TofBurst, TofInfo, View
+from tofcapture.frames import TofInfo, View
 from tofcapture.ops.crop import Crop, crop_depth, find_crop, refine_clearance
 from tofcapture.ops.denoise import denoise
 from tofcapture.ops.normals import PlaneField, grazing
 from tofcapture.ops.phase import Decoder
-from tofcapture.ops.project import Projection, project, triangulate
+from tofcapture.ops.project import Projection, Sheet, project, triangulate
 from tofcapture.poses import Float64, transform_points
 from tofcapture.rig import Rig
 
+Float32 = NDArray[np.float32]
 SCALES = (1, 2)  # always there
 FINEST = (*SCALES, 4)
-SPARSE = 4  # pixels of the stereo grid between points that vote for the table
+SPARSE = 4  # pixels between points that vote for the table
 
 
 @dataclass(frozen=True)
@@ -38,7 +34,7 @@ class SampleConfig:
     Attributes
     ----------
     crop_radius
-        Largest distance of the object from the point the ToF camera looks at, along the table, metres; from 100 m on
+        Largest distance of the object from the point the ToF camera looks at, along the table, metres. From 100 m on
         everything is the object: no table is looked for and no pixel is OUTSIDE.
     far
         Largest depth of ground truth in the ToF frame, metres.
@@ -61,9 +57,8 @@ class SampleConfig:
         object.__setattr__(self, "scales", tuple(self.scales))
 
     def table(self) -> dict[str, Any]:
-        """As JSON types; the scales only where they are not the default, which shards have always had."""
-        table: dict[str, Any] = {"crop_radius": self.crop_radius, "far": self.far}
-        return table if self.scales == SCALES else {**table, "scales": list(self.scales)}
+        """Return the config as JSON types."""
+        return {"crop_radius": self.crop_radius, "far": self.far, "scales": list(self.scales)}
 
 
 def make_sample(
@@ -71,7 +66,8 @@ def make_sample(
     rig: Rig,
     config: SampleConfig,
     rng: np.random.Generator,
-    depth: NDArray[np.float32] | None = None,
+    decoder: Decoder,
+    depth: Float32 | None = None,
 ) -> Sample:
     """Make one sample: the paper's pre-processing, section III.
 
@@ -85,37 +81,35 @@ def make_sample(
         Constants of the ground truth.
     rng
         Draws the triples of the plane search; the same state gives the same sample.
+    decoder
+        Of the ToF camera: :func:`decoder_for`.
     depth
         (SH, SW) z of the view's point map, for a view that was read without it.
-
-    Returns
-    -------
-    Sample
 
     Raises
     ------
     DataError
-        When the view and the rig are of different cameras.
+        The view and the rig are of different cameras.
     """
     check_cameras(view, rig)
     T_base_tof = view.arm_before.T_base_flange @ rig.T_flange_tof
-    tof = decode_burst(view.tof, calibrated(view.tof.info, rig))
+    # Decode the burst, averaged as I and Q.
+    decoded = decoder.burst(view.tof.raw, float(np.mean(view.tof.celsius)))
+    # Denoise the stereo depth.
     measured = np.ascontiguousarray(view.stereo.points[..., 2] if depth is None else depth)
     native = np.where(denoise(measured, rig.stereo), measured, np.float32(np.nan))
-    sheet = triangulate(native, rig.stereo)
-    field = PlaneField(np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
+    # Align it with the ToF camera, and crop what stands on the table.
     crop = find_object(native, rig, T_base_tof, config, rng)
-    truths = {}
-    for scale in config.scales:
-        camera = rig.tof.scaled(scale)
-        projection = project(sheet, rig.stereo, rig.T_tof_stereo, camera, edge_pixels=scale, far=config.far)
-        truths[scale] = assemble(smoothed(projection, field, rig, camera), rig, camera, crop)
+    # Project the surface on the ToF plane, with normals and mask.
+    sheet = triangulate(native, rig.stereo)
+    planes = PlaneField(np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
+    truths = {scale: _ground_truth(sheet, planes, crop, rig, scale, config.far) for scale in config.scales}
     return Sample(
         index=view.index,
         raw=view.tof.raw,
         celsius=np.asarray(view.tof.celsius, dtype=np.float64),
         time_ns=np.asarray(view.tof.time_ns, dtype=np.int64),
-        tof=tof,
+        tof=TofMaps(decoded.depth, decoded.confidence, decoded.flags),
         native_depth=crop_depth(crop, native, rig.stereo, rig.T_tof_stereo),
         ground_truth=truths,
         T_base_tof=T_base_tof,
@@ -143,21 +137,21 @@ def calibrated(info: TofInfo, rig: Rig) -> TofInfo:
     )
 
 
-def decode_burst(burst: TofBurst, info: TofInfo) -> TofMaps:
-    """Average a burst as I and Q, decode it to depth, confidence and flags."""
-    decoder = _decoder(dumps(tof_table(info)), threading.get_ident())
-    found = decoder.burst(burst.raw, float(np.mean(burst.celsius)))
-    return TofMaps(found.depth, found.confidence, found.flags)
+def decoder_for(view: View, rig: Rig) -> Decoder:
+    """Build the decoder of a view's ToF camera by the rig's constants; it serves all views of that camera."""
+    return Decoder(calibrated(view.tof.info, rig))
 
 
-@lru_cache(maxsize=2)
-def _decoder(info: str, thread: int) -> Decoder:  # noqa: ARG001  a decoder's buffers serve one thread
-    """Build the tables of a camera once for all views of a scene."""
-    return Decoder(tof_from(json.loads(info), "tof_info"))
+def _ground_truth(
+    sheet: Sheet, planes: PlaneField, crop: Crop, rig: Rig, scale: int, far: float
+) -> GroundTruth:
+    camera = rig.tof.scaled(scale)
+    seen = project(sheet, rig.stereo, rig.T_tof_stereo, camera, edge_pixels=scale, far=far)
+    return masked(smoothed(seen, planes, rig, camera), rig, camera, crop)
 
 
 def find_object(
-    native: NDArray[np.float32], rig: Rig, T_base_tof: Float64, config: SampleConfig, rng: np.random.Generator
+    native: Float32, rig: Rig, T_base_tof: Float64, config: SampleConfig, rng: np.random.Generator
 ) -> Crop:
     """Find the table, and so the object on it, in every fourth point of every fourth row of stereo depth (SH, SW)."""
     points = native[::SPARSE, ::SPARSE, None] * rig.stereo.rays[::SPARSE, ::SPARSE]
@@ -165,15 +159,15 @@ def find_object(
     return find_crop(points, T_base_tof[2, :3], rng, config.crop_radius, config.far)
 
 
-def smoothed(projection: Projection, field: PlaneField, rig: Rig, camera: Camera) -> Projection:
+def smoothed(projection: Projection, planes: PlaneField, rig: Rig, camera: Camera) -> Projection:
     """Take depth and normals of the planes that fit the surface where it is flat but for noise."""
-    depth, normals = field.smooth(
+    depth, normals = planes.smooth(
         projection.depth, projection.normals, projection.pixels, camera, rig.T_tof_stereo
     )
     return replace(projection, depth=depth, normals=normals)
 
 
-def assemble(projection: Projection, rig: Rig, camera: Camera, crop: Crop) -> GroundTruth:
+def masked(projection: Projection, rig: Rig, camera: Camera, crop: Crop) -> GroundTruth:
     """Put every reason for mistrust into the bits of one mask; where nothing is cropped, nothing is OUTSIDE."""
     some = projection.depth[::SPARSE, ::SPARSE, None] * camera.rays[::SPARSE, ::SPARSE]
     crop = refine_clearance(crop, some[~projection.edge[::SPARSE, ::SPARSE]])

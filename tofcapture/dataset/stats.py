@@ -1,19 +1,20 @@
-"""What a dataset holds, in numbers: distributions by split, mask and flag bits, views that stand out."""
+"""Count what a dataset holds: distributions by split, mask and flag bits, views that stand out."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.files.layout import SPLITS, MaskBit, TofFlag
-from tofcapture.files.manifest import SceneEntry, load_manifest, manifest_path
+from tofcapture.files.layout import SPLITS, MaskBit
+from tofcapture.files.manifest import load_manifest, manifest_path
 from tofcapture.files.seal import sha256_of
 from tofcapture.files.shard import ShardReader
+from tofcapture.frames import TofFlag
 
 Array = NDArray[Any]
 BINS = 400
@@ -62,15 +63,7 @@ QUANTITIES = (
 
 @dataclass
 class Tally:
-    """Counts of one quantity.
-
-    Attributes
-    ----------
-    counts
-        (BINS,) values by bin; those beyond the range are in the outermost.
-    low, high
-        Smallest and largest value.
-    """
+    """Counts (BINS,) of one quantity, values beyond its range in the outermost bins; smallest and largest value."""
 
     quantity: Quantity
     counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(BINS, np.int64))
@@ -95,11 +88,12 @@ class Tally:
 
     def table(self) -> dict[str, Any]:
         """As JSON types."""
-        if not self.counts.sum():
-            return {"unit": self.quantity.unit, "count": 0}
-        quantiles = {f"p{round(100 * q)}": self.quantile(q) for q in (0.01, 0.25, 0.5, 0.75, 0.99)}
         count = int(self.counts.sum())
-        return {"unit": self.quantity.unit, "count": count, "min": self.low, "max": self.high, **quantiles}
+        out: dict[str, Any] = {"unit": self.quantity.unit, "count": count}
+        if count:
+            quantiles = {f"p{round(100 * q)}": self.quantile(q) for q in (0.01, 0.25, 0.5, 0.75, 0.99)}
+            out |= {"min": self.low, "max": self.high, **quantiles}
+        return out
 
 
 @dataclass
@@ -114,6 +108,18 @@ class SplitStats:
     mask: dict[str, int] = field(default_factory=lambda: {"GOOD": 0, **{str(b.name): 0 for b in MaskBit}})
     flags: dict[str, int] = field(default_factory=lambda: {str(b.name): 0 for b in TofFlag})
 
+    def add(self, arrays: Mapping[str, Array], mask: Array, flags: Array) -> None:
+        """Count one view."""
+        for name, values in arrays.items():
+            self.tallies[name].add(values)
+        self.views += 1
+        self.pixels += mask.size
+        self.tof_pixels += flags.size
+        self.mask["GOOD"] += int((mask == 0).sum())
+        for counts, bits, image in ((self.mask, MaskBit, mask), (self.flags, TofFlag, flags)):
+            for bit in bits:
+                counts[str(bit.name)] += int(((image & bit) > 0).sum())
+
     def table(self) -> dict[str, Any]:
         """As JSON types; shares of mask and flag bits are of all pixels."""
         return {
@@ -127,19 +133,7 @@ class SplitStats:
 
 @dataclass(frozen=True)
 class Outlier:
-    """A view one of whose numbers stands out.
-
-    Attributes
-    ----------
-    scene, view
-        Which.
-    name
-        Of the number, as in :func:`view_numbers`.
-    value, median
-        The view's, and that of all views.
-    deviations
-        Their difference in robust standard deviations.
-    """
+    """A number of a view that stands out: its value, the median of all views, robust standard deviations between."""
 
     scene: str
     view: int
@@ -160,32 +154,65 @@ class DatasetStats:
     outliers: Sequence[Outlier]
 
     def table(self) -> dict[str, Any]:
-        """As JSON types."""
+        """As JSON types; numbers that are not finite become null."""
+        rows = [
+            {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
+            for row in self.views
+        ]
         return {
             "format": "tofcapture-stats",
             "version": 1,
             "dataset": str(self.dataset),
             "manifest_sha256": self.manifest_sha256,
             "splits": {name: split.table() for name, split in self.splits.items()},
-            "outliers": [vars(o) for o in self.outliers],
-            "views": [
-                {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
-                for row in self.views
-            ],
+            "outliers": [asdict(o) for o in self.outliers],
+            "views": rows,
         }
 
 
-def incidence_deg(normals: Array, rays: Array) -> Array:
-    """Angle between the ray and the surface's normal, degrees (H, W), of normals (H, W, 3); NaN where they are."""
-    cosine = -np.einsum("hwc,hwc->hw", normals.astype(np.float64), rays) / np.linalg.norm(rays, axis=-1)
-    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+def dataset_stats(
+    dataset: Path, progress: Callable[[int, int], None] = lambda _done, _total: None
+) -> DatasetStats:
+    """Count a dataset in one pass over its shards.
+
+    Parameters
+    ----------
+    dataset
+        Folder with a manifest.
+    progress
+        Told views done and views in all.
+
+    Raises
+    ------
+    DataError
+        The manifest or a shard is missing or damaged.
+    """
+    manifest = load_manifest(dataset)
+    splits = {name: SplitStats() for name in SPLITS if manifest.split(name)}
+    rows: list[dict[str, Any]] = []
+    total = sum(e.views for e in manifest.scenes.values())
+    for name, entry in sorted(manifest.scenes.items()):
+        split = splits[entry.split]
+        split.scenes += 1
+        with ShardReader(dataset / entry.path, entry.sha256) as shard:
+            for view in range(shard.views):
+                arrays, mask, flags = _view(shard, view)
+                split.add(arrays, mask, flags)
+                numbers = {key: _median(values) for key, values in arrays.items()}
+                numbers |= {
+                    "good_share": float((mask == 0).mean()),
+                    "flagged_share": float((flags != 0).mean()),
+                }
+                rows.append({"scene": name, "split": entry.split, "view": view, **numbers})
+        progress(len(rows), total)
+    return DatasetStats(Path(dataset), sha256_of(manifest_path(dataset)), splits, rows, outliers(rows))
 
 
-def view_arrays(shard: ShardReader, view: int) -> dict[str, Array]:
-    """Every quantity of one view: ground truth and angles where the mask at 1x is 0."""
+def _view(shard: ShardReader, view: int) -> tuple[dict[str, Array], Array, Array]:
+    """Quantities of one view (ground truth and angles where the mask at 1x is 0), its mask and its flags."""
     tof, gt = shard.tof(view), shard.ground_truth(view, 1)
     good = gt.mask == 0
-    return {
+    arrays = {
         "gt_depth": gt.depth[good],
         "tof_depth": tof.depth[np.isfinite(tof.depth)],
         "tof_minus_gt": (tof.depth - gt.depth)[good],
@@ -193,30 +220,22 @@ def view_arrays(shard: ShardReader, view: int) -> dict[str, Array]:
         "incidence": incidence_deg(gt.normals, shard.camera.rays)[good],
         "celsius": np.array([shard.celsius(view, frame) for frame in range(shard.frames)]),
     }
+    return arrays, gt.mask, tof.flags
 
 
-def view_numbers(arrays: Mapping[str, Array], mask: Array, flags: Array) -> dict[str, float]:
-    """What one view is compared by: the medians of its quantities, the shares of good and of flagged pixels."""
-    finite = {name: values[np.isfinite(values)] for name, values in arrays.items()}
-    medians = {name: float(np.median(v)) if v.size else float("nan") for name, v in finite.items()}
-    return {**medians, "good_share": float((mask == 0).mean()), "flagged_share": float((flags != 0).mean())}
+def _median(values: Array) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else float("nan")
 
 
-def _count(split: SplitStats, arrays: Mapping[str, Array], mask: Array, flags: Array) -> None:
-    for name, values in arrays.items():
-        split.tallies[name].add(values)
-    split.views += 1
-    split.pixels += mask.size
-    split.tof_pixels += flags.size
-    split.mask["GOOD"] += int((mask == 0).sum())
-    for bit in MaskBit:
-        split.mask[str(bit.name)] += int(((mask & bit) > 0).sum())
-    for flag in TofFlag:
-        split.flags[str(flag.name)] += int(((flags & flag) > 0).sum())
+def incidence_deg(normals: Array, rays: Array) -> Array:
+    """Angle between ray and surface normal, degrees (H, W), of normals (H, W, 3); NaN where they are."""
+    cosine = -np.einsum("hwc,hwc->hw", normals.astype(np.float64), rays) / np.linalg.norm(rays, axis=-1)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def outliers(views: Sequence[Mapping[str, Any]]) -> list[Outlier]:
-    """Views that stand out in a number, largest deviation first.
+    """Find views that stand out in a number, largest deviation first.
 
     A number stands out when it is more than :data:`STANDS_OUT` robust standard deviations (1.4826 times the median absolute
     deviation, with a floor for each number) from the median of all views. A view without a good pixel always does.
@@ -240,43 +259,3 @@ def outliers(views: Sequence[Mapping[str, Any]]) -> list[Outlier]:
             if abs(z) > STANDS_OUT and not (name == "good_share" and value == 0):
                 found.append(Outlier(row["scene"], row["view"], name, float(value), median, float(z)))
     return sorted(found, key=lambda o: -abs(o.deviations))
-
-
-def dataset_stats(dataset: Path, progress: Callable[[int, int], None] | None = None) -> DatasetStats:
-    """Statistics of a dataset, one pass over its shards.
-
-    Parameters
-    ----------
-    dataset
-        Folder with a manifest.
-    progress
-        Told views done and views in all.
-
-    Raises
-    ------
-    DataError
-        The manifest or a shard is missing or damaged.
-    """
-    manifest = load_manifest(dataset)
-    splits = {name: SplitStats() for name in SPLITS if manifest.split(name)}
-    rows: list[dict[str, Any]] = []
-    total = sum(e.views for e in manifest.scenes.values())
-    for name, entry in sorted(manifest.scenes.items()):
-        splits[entry.split].scenes += 1
-        rows += _scene(dataset, name, entry, splits[entry.split])
-        if progress:
-            progress(len(rows), total)
-    return DatasetStats(Path(dataset), sha256_of(manifest_path(dataset)), splits, rows, outliers(rows))
-
-
-def _scene(dataset: Path, name: str, entry: SceneEntry, split: SplitStats) -> list[dict[str, Any]]:
-    rows = []
-    with ShardReader(dataset / entry.path, entry.sha256) as shard:
-        for view in range(shard.views):
-            arrays, flags = view_arrays(shard, view), shard.flags(view)
-            mask = shard.ground_truth(view, 1).mask
-            _count(split, arrays, mask, flags)
-            rows.append(
-                {"scene": name, "split": entry.split, "view": view, **view_numbers(arrays, mask, flags)}
-            )
-    return rows

@@ -14,27 +14,136 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tofcapture.camera import Camera
 from tofcapture.errors import DataError, FormatError
-from tofcapture.files.info import tof_table
+from tofcapture.files.hdf import Array
+from tofcapture.files.info import tof_from, tof_table
 from tofcapture.files.layout import SPLITS
-from tofcapture.files.manifest import SceneEntry, load_manifest
-from tofcapture.files.packed import AGAIN, SCALE, PackedScene, dtype_from, dtype_table, record_dtype
-from tofcapture.files.seal import fsync, partial_path, sealed_digest, sha256_of, write_text
-from tofcapture.files.shard import ShardReader
-from tofcapture.files.signed import parse_json, parse_signed, signed_text
+from tofcapture.files.manifest import SceneEntry, load_manifest, load_signed, signed_text
+from tofcapture.files.seal import (
+    remember,
+    remembered,
+    replacing,
+    sealed_digest,
+    sha256_of,
+    verify,
+    write_text,
+)
+from tofcapture.files.shard import GroundTruth, Scale, ShardReader
+from tofcapture.frames import TofInfo
 
 FORMAT, VERSION = "tofcapture-cache", 1
+SCALE: Scale = 2  # of the ground truth in a cache
 _INDEX = "index.json"
+_AGAIN = "pack the split again: tofcapture pack DATASET --split SPLIT --out CACHE"
+_MAPS = ("depth", "normals", "mask")
+Progress = Callable[[str, int, int], None]
+"""Called with a scene, its views that are packed, its views in all."""
 
 
-def pack(
-    dataset: Path, split: str, out: Path, progress: Callable[[str, int, int], None] | None = None
-) -> dict[str, PackedScene]:
+class PackedScene:
+    """Reads one scene of a cache; maps its file on first use, pickles as its path.
+
+    Parameters
+    ----------
+    folder
+        Of the cache.
+    scene
+        Name.
+    entry
+        What the index says of the scene.
+
+    Raises
+    ------
+    DataError
+        On first use, when the file is missing or not the one that was packed: it is hashed once per process.
+    """
+
+    def __init__(self, folder: Path, scene: str, entry: Mapping[str, Any]) -> None:
+        self.path = Path(folder) / f"{scene}.bin"
+        self.scene = scene
+        self._entry = dict(entry)
+        self._map: Array | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        fresh = {"path": self.path, "scene": self.scene, "_entry": self._entry, "_map": None}
+        return {**fresh, "known": remembered(self.path)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        remember(state["path"], state.pop("known"))
+        self.__dict__.update(state)
+
+    @cached_property
+    def dtype(self) -> np.dtype[Any]:
+        """Of one record."""
+        return _dtype(self._entry["fields"])
+
+    @cached_property
+    def info(self) -> TofInfo:
+        """The ToF camera that took the bursts."""
+        return tof_from(self._entry["tof_info"], str(self.path))
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the ToF camera."""
+        return self.info.camera
+
+    @property
+    def views(self) -> int:
+        """Number of views."""
+        return int(self._entry["views"])
+
+    @property
+    def frames(self) -> int:
+        """Number of ToF frames per view."""
+        return int(self.dtype["raw"].shape[0])
+
+    @property
+    def records(self) -> Array:
+        """(views,) structured, read-only, mapped into memory: fields raw, celsius, depth, normals, mask."""
+        if self._map is None:
+            expected = self.views * self.dtype.itemsize
+            found = self.path.stat().st_size if self.path.is_file() else "no file"
+            if found != expected:
+                raise DataError(f"{self.path}: expected {expected} bytes, {found} found", hint=_AGAIN)
+            verify(self.path, self._entry["sha256"])
+            self._map = np.memmap(self.path, self.dtype, mode="r")
+        return self._map
+
+    def _record(self, view: int) -> Any:
+        if not 0 <= view < self.views:
+            raise DataError(f"{self.path}: holds {self.views} views, asked for {view}")
+        return self.records[view]
+
+    def raw(self, view: int, frame: int) -> Array:
+        """(K, H, W) phase images of one frame, mapped: bytes are read when they are touched."""
+        if not 0 <= frame < self.frames:
+            raise DataError(f"{self.path}: holds {self.frames} frames a view, asked for {frame}")
+        return np.asarray(self._record(view)["raw"][frame])
+
+    def celsius(self, view: int, frame: int) -> float:
+        """Sensor temperature of one frame; NaN: not told."""
+        return float(self._record(view)["celsius"][frame])
+
+    def ground_truth(self, view: int, scale: Scale = SCALE) -> GroundTruth:
+        """Depth, normals and mask at 2x of the ToF image, mapped."""
+        if scale != SCALE:
+            raise DataError(f"{self.path}: holds ground truth at 2x only, asked for {scale}x")
+        record = self._record(view)
+        return GroundTruth(*(np.asarray(record[name]) for name in _MAPS))
+
+    def close(self) -> None:
+        """Drop the mapping; the next use maps again."""
+        self._map = None
+
+
+def pack(dataset: Path, split: str, out: Path, progress: Progress | None = None) -> dict[str, PackedScene]:
     """Pack a split, or complete a cache that was begun.
 
     Parameters
@@ -46,7 +155,7 @@ def pack(
     out
         The cache's folder; scenes in it that are as the manifest says are kept, others are written anew.
     progress
-        Told scene, views done and views in all.
+        Told after each view.
 
     Returns
     -------
@@ -63,103 +172,85 @@ def pack(
     entries = load_manifest(dataset).split(split) if split in SPLITS else {}
     if not entries:
         raise DataError(f"{dataset}: the split {split!r} is empty", hint=f"splits are {', '.join(SPLITS)}")
-    index = _begun(out, split)
+    index: dict[str, Any] = {"format": FORMAT, "version": VERSION, "split": split, "scenes": {}}
+    if (out / _INDEX).exists():
+        index = _load_index(out)
+        if index["split"] != split:
+            raise FormatError(f"{out}: expected a cache of the split {split!r}, it is of {index['split']!r}")
     for name, entry in entries.items():
         known = index["scenes"].get(name)
         if known is None or known["shard_sha256"] != entry.sha256 or not _whole(out, name, known):
             index["scenes"][name] = _pack_scene(dataset / entry.path, entry, out / f"{name}.bin", progress)
             write_text(out / _INDEX, signed_text(index))
-    _forget(out, index, entries)
+    gone = index["scenes"].keys() - entries.keys()
+    if gone:  # scenes that left the split leave the cache
+        index["scenes"] = {name: index["scenes"][name] for name in entries}
+        write_text(out / _INDEX, signed_text(index))
+    for name in gone:
+        (out / f"{name}.bin").unlink(missing_ok=True)
     return open_cache(out, dataset)
-
-
-def _begun(out: Path, split: str) -> dict[str, Any]:
-    if not (out / _INDEX).exists():
-        out.mkdir(parents=True, exist_ok=True)
-        return {"format": FORMAT, "version": VERSION, "split": split, "scenes": {}}
-    index = _load_index(out)
-    if index["split"] != split:
-        raise FormatError(f"{out}: expected a cache of the split {split!r}, it is of {index['split']!r}")
-    return index
 
 
 def _whole(out: Path, name: str, known: Mapping[str, Any]) -> bool:
     path = out / f"{name}.bin"
-    size = int(known["views"]) * dtype_from(known["dtype"]).itemsize
+    size = int(known["views"]) * _dtype(known["fields"]).itemsize
     return path.is_file() and path.stat().st_size == size
 
 
-def _pack_scene(
-    shard_path: Path, entry: SceneEntry, path: Path, progress: Callable[[str, int, int], None] | None
-) -> dict[str, Any]:
-    """Write one scene's records under a temporary name, fsync, rename; returns its entry of the index."""
-    found = sealed_digest(shard_path)
-    if found != entry.sha256:
+def _pack_scene(shard_path: Path, entry: SceneEntry, path: Path, progress: Progress | None) -> dict[str, Any]:
+    """Write one scene's records; returns its entry of the index."""
+    if sealed_digest(shard_path) != entry.sha256:
         raise DataError(
             f"{shard_path}: is not the shard of the manifest", hint=f"tofcapture check {shard_path}"
         )
-    partial, digest = partial_path(path), hashlib.sha256()
-    with ShardReader(shard_path, entry.sha256) as shard, partial.open("wb") as file:
-        dtype = record_dtype(shard)
-        for view in range(shard.views):
-            record = np.zeros((), dtype)
-            record["raw"] = [shard.raw(view, frame) for frame in range(shard.frames)]
-            record["celsius"] = [shard.celsius(view, frame) for frame in range(shard.frames)]
-            gt = shard.ground_truth(view, SCALE)
-            for name in ("depth", "normals", "mask"):
-                record[name] = getattr(gt, name)
-            data = record.tobytes()
-            file.write(data)
-            digest.update(data)
-            if progress:
-                progress(shard.scene, view + 1, shard.views)
-        info, views = tof_table(shard.info), shard.views
-    fsync(partial)
-    partial.replace(path)
-    fsync(path.parent)
-    return {
-        "views": views,
-        "dtype": dtype_table(dtype),
-        "sha256": digest.hexdigest(),
-        "shard_sha256": entry.sha256,
-        "tof_info": info,
-    }
+    digest = hashlib.sha256()
+    with ShardReader(shard_path, entry.sha256) as shard, replacing(path) as partial:
+        fields = _record_fields(shard)
+        with partial.open("wb") as file:
+            for view in range(shard.views):
+                record = np.zeros((), _dtype(fields))
+                record["raw"] = [shard.raw(view, frame) for frame in range(shard.frames)]
+                record["celsius"] = [shard.celsius(view, frame) for frame in range(shard.frames)]
+                gt = shard.ground_truth(view, SCALE)
+                for name in _MAPS:
+                    record[name] = getattr(gt, name)
+                file.write(record.tobytes())
+                digest.update(record.tobytes())
+                if progress:
+                    progress(shard.scene, view + 1, shard.views)
+        return {
+            "views": shard.views,
+            "fields": fields,
+            "sha256": digest.hexdigest(),
+            "shard_sha256": entry.sha256,
+            "tof_info": tof_table(shard.info),
+        }
 
 
-def _forget(out: Path, index: dict[str, Any], entries: Mapping[str, SceneEntry]) -> None:
-    """Scenes that left the split leave the cache."""
-    gone = index["scenes"].keys() - entries.keys()
-    if not gone:
-        return
-    for name in gone:
-        del index["scenes"][name]
-    write_text(out / _INDEX, signed_text(index))
-    for name in gone:
-        (out / f"{name}.bin").unlink(missing_ok=True)
+def _record_fields(shard: ShardReader) -> list[Any]:
+    """Name, format and shape of the fields of a record; float64 first, so that no field straddles its alignment."""
+    raw, gt = shard.raw(0, 0), shard.ground_truth(0, SCALE)
+    maps = {"depth": gt.depth, "normals": gt.normals, "raw": np.broadcast_to(raw, (shard.frames, *raw.shape))}
+    maps["mask"] = gt.mask
+    return [["celsius", "<f8", [shard.frames]]] + [[n, a.dtype.str, list(a.shape)] for n, a in maps.items()]
+
+
+def _dtype(fields: list[Any]) -> np.dtype[Any]:
+    return np.dtype([(name, kind, tuple(shape)) for name, kind, shape in fields], align=True)
 
 
 def _load_index(cache: Path) -> dict[str, Any]:
-    path = Path(cache) / _INDEX
-    try:
-        data = path.read_bytes()
-    except OSError as err:
-        raise DataError(
-            f"{path}: cannot read the cache's index: {err}", hint="tofcapture pack DATASET"
-        ) from err
-    index = parse_json(data, str(path), AGAIN)
-    if (index.get("format"), index.get("version")) != (FORMAT, VERSION):
-        raise FormatError(f"{path}: expected {FORMAT} version {VERSION}", hint=AGAIN)
-    return parse_signed(data, str(path), AGAIN)
+    return load_signed(Path(cache) / _INDEX, "cache's index", (FORMAT, VERSION), _AGAIN)
 
 
 def is_cache(folder: Path) -> bool:
-    """Whether a folder says that it is a cache, damaged or not."""
+    """Tell whether a folder says that it is a cache, damaged or not."""
     path = folder / _INDEX
     return path.is_file() and FORMAT.encode() in path.read_bytes()
 
 
 def open_cache(cache: Path, dataset: Path | None = None) -> dict[str, PackedScene]:
-    """Scenes of a cache, by name, sorted.
+    """Open the scenes of a cache, by name, sorted.
 
     Parameters
     ----------
@@ -177,28 +268,21 @@ def open_cache(cache: Path, dataset: Path | None = None) -> dict[str, PackedScen
     """
     cache = Path(cache)
     index = _load_index(cache)
-    try:
-        scenes = {name: dict(entry) for name, entry in sorted(index["scenes"].items())}
-        packed = {name: entry["shard_sha256"] for name, entry in scenes.items()}
-        split = str(index["split"])
-        for entry in scenes.values():
-            dtype_from(entry["dtype"])
-            int(entry["views"])
-    except (KeyError, TypeError, ValueError, AttributeError) as err:
-        raise FormatError(f"{cache}: the index lacks or garbles a part: {err!r}", hint=AGAIN) from err
+    scenes = {name: PackedScene(cache, name, entry) for name, entry in sorted(index["scenes"].items())}
     if dataset is not None:
-        now = {name: entry.sha256 for name, entry in load_manifest(dataset).split(split).items()}
-        if now != packed:
-            changed = sorted(k for k in now.keys() | packed.keys() if now.get(k) != packed.get(k))
+        packed = {name: entry["shard_sha256"] for name, entry in index["scenes"].items()}
+        now = {name: entry.sha256 for name, entry in load_manifest(dataset).split(index["split"]).items()}
+        changed = sorted(k for k in now.keys() | packed.keys() if now.get(k) != packed.get(k))
+        if changed:
             raise DataError(
                 f"{cache}: is stale: {', '.join(changed)} changed in {dataset} since",
-                hint=f"tofcapture pack {dataset} --split {split} --out {cache}",
+                hint=f"tofcapture pack {dataset} --split {index['split']} --out {cache}",
             )
-    return {name: PackedScene(cache, name, entry) for name, entry in scenes.items()}
+    return scenes
 
 
 def verify_cache(cache: Path) -> list[str]:
-    """Names of scenes whose file is not the one that was packed; hashes every byte."""
+    """Hash every file; names of the scenes whose file is not the one that was packed."""
     scenes = _load_index(cache)["scenes"]
     paths = {name: Path(cache) / f"{name}.bin" for name in sorted(scenes)}
     return [n for n, p in paths.items() if not p.is_file() or sha256_of(p) != scenes[n]["sha256"]]

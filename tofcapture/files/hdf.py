@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,46 +12,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.errors import DataError, FormatError
+from tofcapture.files.info import dumps
 from tofcapture.files.layout import Field, Layout
 
 Array = NDArray[Any]
+DAMAGES = (OSError, RuntimeError, ValueError, KeyError)  # what h5py raises of a damaged file
+_FILTERS = {
+    "shuffle": True,
+    "compression": "gzip",
+    "compression_opts": 1,  # half a per cent more bytes than 4, written and read a third faster (docs/decisions/0012)
+    "fletcher32": True,
+}
 
 
-def create(
-    file: h5py.File,
-    field: Field,
-    shape: tuple[int, ...],
-    dtype: str | np.dtype[Any],
-    gzip: int,
-    chunks: tuple[int, ...] | None = None,
-) -> h5py.Dataset:
+def create(file: h5py.File, field: Field, shape: tuple[int, ...], dtype: np.dtype[Any]) -> h5py.Dataset:
     """Create a field's dataset; the same calls give the same bytes (no time stamps).
 
-    Parameters
-    ----------
-    file
-        Open for writing.
-    field
-        What to create.
-    shape, dtype
-        The dtype must be one that the field allows.
-    gzip
-        Level 1 to 9 for chunked fields.
-    chunks
-        Other chunks than one per entry of the field's leading dims.
+    Raises
+    ------
+    FormatError
+        The field does not allow this dtype.
     """
-    if np.dtype(dtype).name not in field.dtypes:
-        raise FormatError(f"/{field.path}: expected {' or '.join(field.dtypes)}, got {np.dtype(dtype).name}")
-    storage: dict[str, Any] = {}
-    if field.chunk is not None:
-        storage = {
-            "chunks": chunks or (1,) * field.chunk + shape[field.chunk :],
-            "shuffle": True,
-            "compression": "gzip",
-            "compression_opts": gzip,
-            "fletcher32": True,
-        }
-    dataset = file.create_dataset(field.path, shape, dtype, track_times=False, **storage)
+    if dtype.name not in field.dtypes:
+        raise FormatError(f"/{field.path}: expected {' or '.join(field.dtypes)}, got {dtype.name}")
+    chunks = field.chunks(shape)
+    how: dict[str, Any] = {} if chunks is None else {"chunks": chunks, **_FILTERS}
+    dataset = file.create_dataset(field.path, shape, dtype, track_times=False, **how)
     dataset.attrs["units"] = field.units
     dataset.attrs["description"] = field.doc
     return dataset
@@ -64,21 +50,8 @@ def write_attrs(file: h5py.File, layout: Layout, values: Mapping[str, Any]) -> N
         file.attrs[name] = dumps(known[name]) if kind == "JSON" else known[name]
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"expected JSON types, got {type(value).__name__}")
-
-
-def dumps(value: Any) -> str:
-    """Write JSON with sorted keys; numpy scalars and arrays become plain numbers, floats keep every bit."""
-    return json.dumps(value, sort_keys=True, default=_plain)
-
-
-def open_checked(path: Path, layout: Layout, *earlier: Layout) -> h5py.File:
-    """Open a file for reading and make sure that it is of the layout, or of an earlier one that the caller can read.
+def open_checked(path: Path, layout: Layout) -> h5py.File:
+    """Open a file for reading and make sure that it is of the layout.
 
     Raises
     ------
@@ -88,30 +61,28 @@ def open_checked(path: Path, layout: Layout, *earlier: Layout) -> h5py.File:
         HDF5 of another format or version.
     """
     try:
-        # chunks are single frames, read whole: HDF5 2 would keep 8 MB of each field of each open file for nothing
+        # Chunks are single frames, read whole: HDF5 2 would keep 8 MB of each field of each open file for nothing.
         file = h5py.File(path, "r", rdcc_nbytes=0)
     except FileNotFoundError as err:
         raise DataError(f"{path}: expected a {layout.format} file, found nothing there") from err
-    except (OSError, RuntimeError, ValueError) as err:
+    except DAMAGES as err:
         raise DataError(f"{path}: cannot be opened as HDF5: {err}", hint=f"tofcapture check {path}") from err
     try:
-        _check_format(file, path, layout, [old.version for old in earlier])
+        _check_format(file, path, layout)
     except BaseException:
         file.close()
         raise
     return file
 
 
-def _check_format(file: h5py.File, path: Path, layout: Layout, earlier: Sequence[int]) -> None:
+def _check_format(file: h5py.File, path: Path, layout: Layout) -> None:
     found, version = text_attr(file, "format", path), attr(file, "version", path)
     if found != layout.format:
         raise FormatError(f"{path}: expected format {layout.format}, got {found!r}")
-    if version not in (layout.version, *earlier):
+    if version != layout.version:
         raise FormatError(
             f"{path}: expected {layout.format} version {layout.version}, got {version}",
-            hint="a newer tofcapture wrote it: upgrade"
-            if version > layout.version
-            else f"tofcapture migrate {path}",
+            hint="another tofcapture wrote it: upgrade",
         )
 
 
@@ -119,7 +90,7 @@ def attr(file: h5py.File, name: str, path: Path) -> Any:
     """Read a root attribute, or say that it is missing or damaged."""
     try:
         return file.attrs[name]
-    except (KeyError, OSError, RuntimeError, ValueError, TypeError) as err:
+    except (*DAMAGES, TypeError) as err:
         raise FormatError(f"{path}: expected the attribute {name!r}, cannot read it: {err}") from err
 
 
@@ -145,9 +116,9 @@ def fetch(file: h5py.File, field: Field, path: Path, part: Any = ()) -> Array:
     Raises
     ------
     FormatError
-        When it is missing or of another dtype.
+        It is missing or of another dtype.
     DataError
-        When its bytes are damaged (Fletcher-32).
+        Its bytes are damaged (Fletcher-32).
     """
     dataset = file.get(field.path)
     if not isinstance(dataset, h5py.Dataset):
@@ -158,5 +129,5 @@ def fetch(file: h5py.File, field: Field, path: Path, part: Any = ()) -> Array:
         )
     try:
         return np.asarray(dataset[part])
-    except (OSError, RuntimeError, ValueError) as err:
+    except DAMAGES as err:
         raise DataError(f"{path}: /{field.path} is damaged: {err}", hint=f"tofcapture check {path}") from err

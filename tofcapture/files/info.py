@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,19 @@ import numpy as np
 from tofcapture.errors import FormatError, TofError
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.rig import camera_from, camera_table, range_error_from, range_error_table
+
+
+def dumps(value: Any) -> str:
+    """Write JSON with sorted keys; numpy scalars and arrays become plain numbers, floats keep every bit."""
+    return json.dumps(value, sort_keys=True, default=_plain)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"expected JSON types, got {type(value).__name__}")
 
 
 def tof_table(info: TofInfo) -> dict[str, Any]:
@@ -28,13 +43,7 @@ def tof_table(info: TofInfo) -> dict[str, Any]:
 
 
 def tof_from(table: Mapping[str, Any], where: str) -> TofInfo:
-    """Read what :func:`tof_table` wrote.
-
-    Raises
-    ------
-    FormatError
-        When something is missing or says something impossible.
-    """
+    """Read what :func:`tof_table` wrote; :class:`FormatError` when something is missing or impossible."""
     try:
         return TofInfo(
             model=str(table["model"]),
@@ -57,7 +66,7 @@ def stereo_table(info: StereoInfo) -> dict[str, Any]:
 
 
 def stereo_from(table: Mapping[str, Any], where: str) -> StereoInfo:
-    """Read what :func:`stereo_table` wrote; :class:`FormatError` when it cannot be."""
+    """Read what :func:`stereo_table` wrote; :class:`FormatError` when something is missing or impossible."""
     try:
         return StereoInfo(str(table["model"]), str(table["serial"]), camera_from(table["camera"], where))
     except (KeyError, TypeError, ValueError, TofError) as err:

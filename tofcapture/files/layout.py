@@ -1,31 +1,16 @@
 """The formats as data: what a view file and a shard hold, and what it means.
 
-Writers create what is listed here, readers fetch it, :mod:`tofcapture.files.check` compares a file with it and
-``python -m tofcapture.files.page > docs/formats.md`` prints it. Changing a layout means raising its version.
+Writers create what is listed here, readers fetch it, :mod:`tofcapture.files.check` compares a file with it, and
+``python -m tofcapture.files.layout > docs/formats.md`` prints it. Changing a layout means raising its version.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntFlag
 
 from tofcapture.frames import TOF_FLAG_DOCS, TofFlag
-
-__all__ = [
-    "BOARD_SCENE",
-    "LAYOUTS",
-    "MASK_DOCS",
-    "SHARD",
-    "SHARD_1",
-    "SPLITS",
-    "TOF_FLAG_DOCS",
-    "VIEW",
-    "Field",
-    "Layout",
-    "MaskBit",
-    "TofFlag",
-]
 
 BOARD_SCENE = "calibration"  # views of the board; never part of a dataset
 SPLITS = ("train", "val", "test")
@@ -65,25 +50,31 @@ class Field:
         ``SH SW`` the stereo grid, or a number.
     units
         Stored as the dataset's attribute ``units``; ``1`` is a plain number.
-    doc
-        What it means, stored as the attribute ``description``.
     chunk
-        Number of leading dims with one entry per chunk; ``None`` stores small data contiguously and unfiltered.
+        Shape of a chunk: ``1`` or the whole of each dim. ``None`` stores small data contiguously and unfiltered.
     optional
         May be absent, with all other optional datasets of its group.
+    doc
+        What it means, stored as the attribute ``description``.
     """
 
     path: str
     dtypes: tuple[str, ...]
     dims: tuple[str, ...]
     units: str
+    chunk: tuple[bool, ...] | None
+    optional: bool
     doc: str
-    chunk: int | None = None
-    optional: bool = False
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
         """Shape for given sizes of ``N F K H W SH SW``."""
         return tuple(_size(dim, sizes) for dim in self.dims)
+
+    def chunks(self, shape: tuple[int, ...]) -> tuple[int, ...] | None:
+        """Shape of a chunk of a dataset of this shape."""
+        if self.chunk is None:
+            return None
+        return tuple(n if whole else 1 for n, whole in zip(shape, self.chunk, strict=True))
 
 
 @dataclass(frozen=True)
@@ -110,189 +101,165 @@ def _size(dim: str, sizes: Mapping[str, int]) -> int:
     return int(digits or 1) * sizes[dim[len(digits) :]]
 
 
-_DESCRIPTION_ATTRS = (
-    ("units", "text", 'always "m"; seconds, radians and hertz elsewhere'),
-    ("rig", "TOML", "the rig, see rig.toml below"),
-    (
-        "tof_info",
-        "JSON",
-        "model, serial, intrinsics, illuminator, modulation_hz, phase_rad, exposure, saturation, range_errors",
-    ),
-    ("stereo_info", "JSON", "model, serial, intrinsics of the point map's grid"),
-    ("provenance", "JSON", "versions, digests of inputs, seeds, UTC time"),
+def _rows(table: str) -> Iterator[list[str]]:
+    for line in table.strip().splitlines():
+        yield [cell.strip() for cell in line.split("|")]
+
+
+def _field(row: list[str]) -> Field:
+    """Read a row of a table: path, dtypes, dims, chunk (``1`` and ``*`` for whole, ``-`` for none), units, meaning."""
+    path, dtypes, dims, chunk, units, doc = row
+    chunks = None if chunk == "-" else tuple(c == "*" for c in chunk.split())
+    name, optional = path.rstrip("?"), path.endswith("?")
+    return Field(name, tuple(dtypes.split()), tuple(dims.split()), units, chunks, optional, doc)
+
+
+def _layout(name: str, version: int, title: str, fields: str, attrs: str) -> Layout:
+    first = f"format | text | `{name}`\nversion | int | {version}\n{attrs.strip()}\n{_DESCRIPTIONS}"
+    texts = tuple((key, kind, doc) for key, kind, doc in _rows(first))
+    return Layout(name, version, title, tuple(map(_field, _rows(fields))), texts)
+
+
+_DESCRIPTIONS = """\
+units       | text | always "m"; seconds, radians and hertz elsewhere
+rig         | TOML | the rig, see rig.toml below
+tof_info    | JSON | model, serial, intrinsics, illuminator, modulation_hz, phase_rad, exposure, saturation, range_errors
+stereo_info | JSON | model, serial, intrinsics of the point map's grid
+provenance  | JSON | versions, digests of inputs, seeds, UTC time
+"""
+_ARM = """\
+arm/{0}/joints        | float64 | 6   | - | rad | measured joint angles {0} the exposures
+arm/{0}/T_base_flange | float64 | 4 4 | - | m   | flange to base, {0} the exposures
+arm/{0}/time_ns       | int64   |     | - | ns  | monotonic clock
+"""
+_PROJECTED = """\
+gt/depth_{0}x{1}   | float32 | N {2}H {2}W   | 1 * *   | m | ground-truth depth on the ToF plane at {0}x; NaN: not hit
+gt/normals_{0}x{1} | float32 | N {2}H {2}W 3 | 1 * * * | 1 | ground-truth normals, ToF frame, unit, facing the camera
+gt/mask_{0}x{1}    | uint8   | N {2}H {2}W   | 1 * *   | 1 | mask bits, see below; 0: good ground truth
+"""
+# One coordinate of the point map per chunk: x, y and z each pack better alone, and depth is read without the others.
+VIEW = _layout(
+    "tofcapture-view",
+    1,
+    "View file `RECORDING/views/<scene>/view-007.h5`",
+    f"""
+tof/raw             | uint16 float64 | F K H W | 1 * * * | DN   | phase images of the static burst, as the sensor gave them
+tof/time_ns         | int64          | F       | -       | ns   | monotonic clock
+tof/celsius         | float64        | F       | -       | degC | sensor temperature; NaN: not told
+stereo/points       | float32        | SH SW 3 | * * 1   | m    | organised point map, stereo frame; NaN: not measured
+stereo/time_ns      | int64          |         | -       | ns   | monotonic clock
+{_ARM.format("before")}{_ARM.format("after")}\
+truth/depth?        | float32        | 2H 2W   | * *     | m    | exact depth on the ToF plane at 2x; NaN: nothing there
+truth/normals?      | float32        | 2H 2W 3 | * * *   | 1    | exact geometric normals, ToF frame, facing the camera
+truth/target?       | bool           | 2H 2W   | * *     | 1    | the ray hits the scene's object
+truth/T_tof_stereo? | float64        | 4 4     | -       | m    | stereo to ToF of the true rig
+truth/T_flange_tof? | float64        | 4 4     | -       | m    | ToF to flange of the true rig
+""",
+    """
+scene | text | name of the scene; `calibration` for views of the board
+index | int  | number of the view, from 0
+""",
 )
-_RAW = ("uint16", "float64")
-_F32, _F64, _I64, _BOOL = ("float32",), ("float64",), ("int64",), ("bool",)
-
-
-def _arm(when: str) -> tuple[Field, ...]:
-    return (
-        Field(f"arm/{when}/joints", _F64, ("6",), "rad", f"measured joint angles {when} the exposures"),
-        Field(f"arm/{when}/T_base_flange", _F64, ("4", "4"), "m", f"flange to base, {when} the exposures"),
-        Field(f"arm/{when}/time_ns", _I64, (), "ns", "monotonic clock"),
-    )
-
-
-VIEW = Layout(
-    format="tofcapture-view",
-    version=1,
-    title="View file `RECORDING/views/<scene>/view-007.h5`",
-    fields=(
-        Field(
-            "tof/raw",
-            _RAW,
-            ("F", "K", "H", "W"),
-            "DN",
-            "phase images of the static burst, as the sensor gave them",
-            1,
-        ),
-        Field("tof/time_ns", _I64, ("F",), "ns", "monotonic clock"),
-        Field("tof/celsius", _F64, ("F",), "degC", "sensor temperature; NaN: not told"),
-        Field(
-            "stereo/points",
-            _F32,
-            ("SH", "SW", "3"),
-            "m",
-            "organised point map, stereo frame; NaN: not measured",
-            0,
-        ),
-        Field("stereo/time_ns", _I64, (), "ns", "monotonic clock"),
-        *_arm("before"),
-        *_arm("after"),
-        Field(
-            "truth/depth",
-            _F32,
-            ("2H", "2W"),
-            "m",
-            "exact depth on the ToF plane at 2x; NaN: nothing there",
-            0,
-            optional=True,
-        ),
-        Field(
-            "truth/normals",
-            _F32,
-            ("2H", "2W", "3"),
-            "1",
-            "exact geometric normals, ToF frame, facing the camera",
-            0,
-            optional=True,
-        ),
-        Field("truth/target", _BOOL, ("2H", "2W"), "1", "the ray hits the scene's object", 0, optional=True),
-        Field("truth/T_tof_stereo", _F64, ("4", "4"), "m", "stereo to ToF of the true rig", optional=True),
-        Field("truth/T_flange_tof", _F64, ("4", "4"), "m", "ToF to flange of the true rig", optional=True),
-    ),
-    attrs=(
-        ("format", "text", "`tofcapture-view`"),
-        ("version", "int", "1"),
-        ("scene", "text", "name of the scene; `calibration` for views of the board"),
-        ("index", "int", "number of the view, from 0"),
-        *_DESCRIPTION_ATTRS,
-    ),
+SHARD = _layout(
+    "tofcapture-shard",
+    1,
+    "Shard `DATASET/shards/<scene>.h5`",
+    f"""
+tof/raw           | uint16 float64 | N F K H W | 1 1 * * * | DN   | phase images, as the sensor gave them
+tof/celsius       | float64        | N F       | -         | degC | sensor temperature; NaN: not told
+tof/time_ns       | int64          | N F       | -         | ns   | monotonic clock
+tof/depth         | float32        | N H W     | 1 * *     | m    | depth decoded from the burst's mean I and Q; NaN: none
+tof/confidence    | float32        | N H W     | 1 * *     | DN   | amplitude of the highest frequency, burst mean
+tof/flags         | uint8          | N H W     | 1 * *     | 1    | flag bits, see below; 0: a good pixel
+gt/native_depth   | float32        | N SH SW   | 1 * *     | m    | cropped and denoised stereo depth (z), stereo frame; NaN: none
+{_PROJECTED.format(1, "", "")}{_PROJECTED.format(2, "", 2)}{_PROJECTED.format(4, "?", 4)}\
+views/T_base_tof  | float64        | N 4 4     | -         | m    | ToF to base, from the measured joints and the rig
+views/index       | int64          | N         | -         | 1    | number of the view in its recording
+truth/depth_2x?   | float32        | N 2H 2W   | 1 * *     | m    | exact depth at 2x (simulated recordings)
+truth/normals_2x? | float32        | N 2H 2W 3 | 1 * * *   | 1    | exact normals at 2x (simulated recordings)
+""",
+    "scene | text | name of the scene",
 )
-
-
-def _projected(scale: int) -> tuple[Field, ...]:
-    s = "" if scale == 1 else str(scale)
-    H, W = f"{s}H", f"{s}W"
-    return (
-        Field(
-            f"gt/depth_{scale}x",
-            _F32,
-            ("N", H, W),
-            "m",
-            f"ground-truth depth on the ToF plane at {scale}x; NaN: not hit",
-            1,
-        ),
-        Field(
-            f"gt/normals_{scale}x",
-            _F32,
-            ("N", H, W, "3"),
-            "1",
-            "ground-truth normals, ToF frame, unit, facing the camera",
-            1,
-        ),
-        Field(
-            f"gt/mask_{scale}x", ("uint8",), ("N", H, W), "1", "mask bits, see below; 0: good ground truth", 1
-        ),
-    )
-
-
-SHARD = Layout(
-    format="tofcapture-shard",
-    version=2,
-    title="Shard `DATASET/shards/<scene>.h5`",
-    fields=(
-        Field("tof/raw", _RAW, ("N", "F", "K", "H", "W"), "DN", "phase images, as the sensor gave them", 2),
-        Field("tof/celsius", _F64, ("N", "F"), "degC", "sensor temperature; NaN: not told"),
-        Field("tof/time_ns", _I64, ("N", "F"), "ns", "monotonic clock"),
-        Field(
-            "tof/depth",
-            _F32,
-            ("N", "H", "W"),
-            "m",
-            "depth decoded from the burst's mean I and Q; NaN: none",
-            1,
-        ),
-        Field(
-            "tof/confidence", _F32, ("N", "H", "W"), "DN", "amplitude of the highest frequency, burst mean", 1
-        ),
-        Field("tof/flags", ("uint8",), ("N", "H", "W"), "1", "flag bits, see below; 0: a good pixel", 1),
-        Field(
-            "gt/native_depth",
-            _F32,
-            ("N", "SH", "SW"),
-            "m",
-            "cropped and denoised stereo depth (z), stereo frame; NaN: none",
-            1,
-        ),
-        *_projected(1),
-        *_projected(2),
-        *(replace(field, optional=True) for field in _projected(4)),
-        Field(
-            "views/T_base_tof",
-            _F64,
-            ("N", "4", "4"),
-            "m",
-            "ToF to base, from the measured joints and the rig",
-        ),
-        Field("views/index", _I64, ("N",), "1", "number of the view in its recording"),
-        Field(
-            "truth/depth_2x",
-            _F32,
-            ("N", "2H", "2W"),
-            "m",
-            "exact depth at 2x (simulated recordings)",
-            1,
-            optional=True,
-        ),
-        Field(
-            "truth/normals_2x",
-            _F32,
-            ("N", "2H", "2W", "3"),
-            "1",
-            "exact normals at 2x (simulated recordings)",
-            1,
-            optional=True,
-        ),
-    ),
-    attrs=(
-        ("format", "text", "`tofcapture-shard`"),
-        ("version", "int", "2"),
-        ("scene", "text", "name of the scene"),
-        *_DESCRIPTION_ATTRS,
-    ),
-)
-
-# Version 1 had one bit of the flags as an array of its own; readers still take it, `tofcapture migrate` rewrites it.
-SHARD_1 = replace(
-    SHARD,
-    version=1,
-    fields=tuple(
-        Field("tof/saturated", _BOOL, ("N", "H", "W"), "1", "a tap of a frame reached saturation", 1)
-        if f.path == "tof/flags"
-        else f
-        for f in SHARD.fields
-    ),
-)
-
 LAYOUTS = {layout.format: layout for layout in (VIEW, SHARD)}
+
+_PAGE = """\
+# Formats
+
+Generated by `python -m tofcapture.files.layout > docs/formats.md`; a test fails when this page is stale.
+
+Everything is metres, seconds, radians, hertz; the attribute `units` of each dataset says so. No measurement is NaN, zero
+never means missing. `T_a_b` maps points of frame b into frame a. Camera frames: x right, y down, z forward. `depth` is z.
+Sizes: `N` views, `F` frames of a burst, `K` raw channels, `H W` ToF image, `SH SW` stereo grid.
+
+Every HDF5 file opens with plain h5py (gzip, shuffle, Fletcher-32). It is written once under the name `*.partial`, verified,
+fsynced, made read-only and renamed; the file `NAME.sha256` beside it holds the digest of all its bytes
+(`sha256sum -c NAME.sha256`). `tofcapture check PATH` lists every problem of a file, a recording or a dataset.
+
+{layouts}
+## Mask bits of `/gt/mask_*`
+
+{mask}
+## Flag bits of `/tof/flags`
+
+{flags}
+## `DATASET/manifest.json`
+
+`{{"format": "tofcapture-manifest", "version": 1, "scenes": {{NAME: {{"path", "sha256", "views", "split"}}}}, "config": {{...}},
+"versions": {{...}}, "sha256": ...}}`; `path` is relative to the dataset, `split` is train, val or test. Scenes of one object (the
+name up to a trailing `-<digits>`) are always in the same split. The last entry is the SHA-256 of the file's own text without that
+entry, keys sorted, indented by one: a changed character is refused, so the file is not edited by hand.
+
+## Cache `CACHE/index.json`, `CACHE/<scene>.bin`
+
+One split of a dataset, packed for training: `tofcapture.files.cache.pack`. A `.bin` file is one record per view, without a
+header, of `{{"raw": F x K x H x W, "celsius": F, "depth", "normals", "mask"}}`, ground truth at 2x; `index.json` holds
+`"format": "tofcapture-cache"`, `"version": 1`, `"split"` and per scene the record's `fields` (name, format, shape), `views`, `sha256`
+of the file, `shard_sha256` of the shard that it was packed from, `tof_info`; its own digest as in the manifest. A cache whose
+shards have changed is refused. `numpy.memmap(path, numpy.dtype([(n, f, tuple(s)) for n, f, s in fields], align=True))` opens it.
+
+## `rig.toml`
+
+`format = "tofcapture-rig"`, `version = 1`, `units = "m"`; tables `[tof]` (width, height, fx, fy, cx, cy, illuminator) and
+`[stereo]` (width, height, fx, fy, cx, cy); `T_tof_stereo` and `T_flange_tof` as 4 x 4 lists; any number of `[[range_error]]`
+(modulation_hz, offset, scale, harmonics as `[order, cosine, sine]`, per_pixel_radius, per_kelvin, reference_celsius; where there
+are any, image as `[power of x, power of y, metres]` with x and y from -1 to 1 across the image, and per_inverse_amplitude). `[tof]`
+has `distortion` (k1, k2, p1, p2, k3 as OpenCV has them) unless its images are a pinhole's; a stereo grid has none.
+"""
+
+
+def _table(header: str, rows: list[str]) -> str:
+    return "\n".join([header, "|---" * (header.count("|") - 1) + "|", *rows, ""])
+
+
+def _section(layout: Layout) -> str:
+    fields = [
+        f"| `/{f.path}` | {' or '.join(f.dtypes)} | {' x '.join(f.dims) or 'scalar'} | {f.units} | {f.doc}"
+        f"{' (optional)' * f.optional} |"
+        for f in layout
+    ]
+    attrs = [f"| `{name}` | {kind} | {doc} |" for name, kind, doc in layout.attrs]
+    return "\n".join(
+        [
+            f"## {layout.title}\n",
+            f'`format = "{layout.format}"`, `version = {layout.version}`.\n',
+            _table("| dataset | dtype | shape | units | meaning |", fields),
+            _table("| attribute | kind | meaning |", attrs),
+        ]
+    )
+
+
+def _bits(docs: Mapping[MaskBit, str] | Mapping[TofFlag, str]) -> str:
+    return _table(
+        "| bit | name | meaning |", [f"| {b.value} | `{b.name}` | {doc} |" for b, doc in docs.items()]
+    )
+
+
+def formats_markdown() -> str:
+    """Print ``docs/formats.md`` from the layouts."""
+    return _PAGE.format(
+        layouts="\n".join(map(_section, (VIEW, SHARD))), mask=_bits(MASK_DOCS), flags=_bits(TOF_FLAG_DOCS)
+    )
+
+
+if __name__ == "__main__":
+    print(formats_markdown(), end="")

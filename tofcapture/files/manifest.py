@@ -1,7 +1,13 @@
-"""``manifest.json``: which scenes a dataset holds, their splits, the digest of every shard."""
+"""``manifest.json``: which scenes a dataset holds, their splits, the digest of every shard.
+
+It carries its own digest, so that a changed character anywhere in it is found. The text is a function of the table (sorted
+keys, one indent): what is read is compared with what would be written, byte for byte.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -9,20 +15,68 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture.errors import DataError, FormatError
+from tofcapture.files.info import dumps
 from tofcapture.files.layout import SPLITS
 from tofcapture.files.seal import write_text
-from tofcapture.files.signed import KEY, parse_json, parse_signed, signed_text
 
-FORMAT, VERSION = "tofcapture-manifest", 2
-UNSIGNED = (
-    1  # version that did not carry its own digest; readers still take it, `tofcapture migrate` signs it
-)
+FORMAT, VERSION = "tofcapture-manifest", 1
+KEY = "sha256"
 _AGAIN = "run build-dataset again, or restore it from a copy"
 COMBINATIONS = ("random",)  # every number is another combination of objects
 
 
+def signed_text(table: Mapping[str, Any]) -> str:
+    """Write a table as JSON with the SHA-256 of its text without that entry under ``sha256``."""
+    body = {name: value for name, value in table.items() if name != KEY}
+    digest = hashlib.sha256(_pretty(body).encode()).hexdigest()
+    return _pretty({**body, KEY: digest})
+
+
+def _pretty(table: Mapping[str, Any]) -> str:
+    return json.dumps(json.loads(dumps(table)), indent=1, sort_keys=True) + "\n"
+
+
+def load_signed(path: Path, what: str, kind: tuple[str, int], hint: str) -> dict[str, Any]:
+    """Read a file of :func:`signed_text`, without its digest.
+
+    Parameters
+    ----------
+    path
+        The file.
+    what
+        Its name in messages.
+    kind
+        Expected ``format`` and ``version``.
+    hint
+        What to do about a damaged one.
+
+    Raises
+    ------
+    DataError
+        It cannot be read, is not JSON, or any byte of it was changed.
+    FormatError
+        It is of another format or version.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as err:
+        raise DataError(f"{path}: cannot read the {what}: {err}", hint) from err
+    try:
+        table = json.loads(data.decode())
+    except (ValueError, RecursionError) as err:
+        raise DataError(f"{path}: not JSON: {err}", hint) from err
+    if not isinstance(table, dict):
+        raise DataError(f"{path}: not a JSON object but {type(table).__name__}", hint)
+    if (table.get("format"), table.get("version")) != kind:
+        raise FormatError(f"{path}: expected {kind[0]} version {kind[1]}", hint)
+    if signed_text(table).encode() != data:
+        raise DataError(f"{path}: its sha256 is not that of its text: changed after it was written", hint)
+    del table[KEY]
+    return table
+
+
 def object_of(scene: str) -> str:
-    """Object of a scene: its name up to a trailing ``-<digits>`` (``mug``, ``mug-2`` are one; ``random-1`` is its own)."""
+    """Return the object of a scene: its name up to a trailing ``-<digits>``; ``random-1`` is its own."""
     stem = re.sub(r"-\d+$", "", scene)
     return scene if stem in COMBINATIONS else stem
 
@@ -66,24 +120,18 @@ class Manifest:
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def split(self, name: str) -> dict[str, SceneEntry]:
-        """Scenes of one split, by name, sorted."""
+        """Return the scenes of one split, by name, sorted."""
         return {k: e for k, e in sorted(self.scenes.items()) if e.split == name}
 
 
 def manifest_path(dataset: Path) -> Path:
-    """Where the manifest of a dataset lies."""
+    """Return where the manifest of a dataset lies."""
     return Path(dataset) / "manifest.json"
 
 
 def write_manifest(dataset: Path, manifest: Manifest) -> Path:
     """Write ``DATASET/manifest.json`` atomically; same content, same bytes."""
     path = manifest_path(dataset)
-    write_text(path, manifest_text(manifest))
-    return path
-
-
-def manifest_text(manifest: Manifest) -> str:
-    """Text of ``manifest.json``, which carries its own SHA-256."""
     table = {
         "format": FORMAT,
         "version": VERSION,
@@ -91,7 +139,8 @@ def manifest_text(manifest: Manifest) -> str:
         "config": dict(manifest.config),
         "versions": dict(manifest.versions),
     }
-    return signed_text(table)
+    write_text(path, signed_text(table))
+    return path
 
 
 def load_manifest(dataset: Path) -> Manifest:
@@ -100,30 +149,18 @@ def load_manifest(dataset: Path) -> Manifest:
     Raises
     ------
     DataError
-        When it is missing, not JSON, or changed after it was written.
+        It is missing, not JSON, or changed after it was written.
     FormatError
-        When it is of another format or version, or an entry is incomplete.
+        It is of another format or version, or an entry is incomplete.
     """
     path = manifest_path(dataset)
-    try:
-        data = path.read_bytes()
-    except OSError as err:
+    if not path.is_file():
         raise DataError(
-            f"{path}: cannot read the dataset's manifest: {err}",
+            f"{path}: cannot read the dataset's manifest: it is not there",
             hint="tofcapture build-dataset RECORDING --out DIR",
-        ) from err
-    table = parse_json(data, str(path), _AGAIN)
-    if table.get("format") != FORMAT or table.get("version") not in (VERSION, UNSIGNED):
-        raise FormatError(f"{path}: expected {FORMAT} version {VERSION}", hint=_AGAIN)
-    if table["version"] == VERSION:
-        parse_signed(data, str(path), _AGAIN)
-    return _parse(table, path)
-
-
-def _parse(table: dict[str, Any], path: Path) -> Manifest:
-    known = {"format", "version", "scenes", "config", "versions"} | (
-        {KEY} if table["version"] == VERSION else set()
-    )
+        )
+    table = load_signed(path, "dataset's manifest", (FORMAT, VERSION), _AGAIN)
+    known = {"format", "version", "scenes", "config", "versions"}
     if table.keys() != known:
         raise FormatError(f"{path}: expected the parts {sorted(known)}, got {sorted(table)}", hint=_AGAIN)
     try:

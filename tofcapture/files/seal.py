@@ -17,14 +17,13 @@ from tofcapture.errors import DataError
 
 PARTIAL = ".partial"
 _SETTLED = 2.0  # s; a file changed since then may change again within one tick of the file system's clock
-_AGAIN = "restore it from a copy, or delete it and run the same command again"
 
 Identity = tuple[int, ...]
 _digests: dict[str, tuple[Identity, str]] = {}  # by absolute path, what this process has hashed
 
 
 def partial_path(path: Path) -> Path:
-    """Temporary name of a file in the making; what an earlier, killed writer left there is removed."""
+    """Return the temporary name of a file in the making; what an earlier, killed writer left there is removed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + PARTIAL)
     partial.unlink(missing_ok=True)
@@ -32,12 +31,26 @@ def partial_path(path: Path) -> Path:
 
 
 def digest_path(path: Path) -> Path:
-    """Where the digest of a sealed file lies."""
+    """Return where the digest of a sealed file lies."""
     return path.with_suffix(".sha256")
 
 
+def digest_text(path: Path, digest: str) -> str:
+    """Return the content of :func:`digest_path`, as ``sha256sum -c`` reads it."""
+    return f"{digest}  {path.name}\n"
+
+
+def stored_digest(path: Path) -> str | None:
+    """Read the digest that was stored when ``path`` was sealed; ``None`` when there is none or it cannot be read."""
+    try:
+        words = digest_path(path).read_text(encoding="ascii").split()
+    except (OSError, UnicodeDecodeError):
+        return None
+    return words[0] if words else None
+
+
 def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal."""
+    """Hash a file's bytes; hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -49,7 +62,7 @@ def _identity(path: Path) -> Identity:
 
 
 def digest_once(path: Path) -> str:
-    """SHA-256 of a file's bytes; a file that this process has hashed and nobody touched since is not read again."""
+    """Hash a file's bytes; a file that this process has hashed and nobody touched since is not read again."""
     name, before = str(path.absolute()), _identity(path)
     if (known := _digests.get(name)) is not None and known[0] == before:
         return known[1]
@@ -60,7 +73,7 @@ def digest_once(path: Path) -> str:
 
 
 def remembered(path: Path) -> tuple[Identity, str] | None:
-    """What :func:`digest_once` knows of a file, for a process that this one starts."""
+    """Return what :func:`digest_once` knows of a file, for a process that this one starts."""
     return _digests.get(str(path.absolute()))
 
 
@@ -70,69 +83,44 @@ def remember(path: Path, known: tuple[Identity, str] | None) -> None:
         _digests.setdefault(str(path.absolute()), known)
 
 
-def verify(path: Path, promised: str | None = None) -> None:
-    """Make sure, once per process, that a file is the one that was sealed.
+def sealed_digest(path: Path, promised: str | None = None) -> str:
+    """Hash a file, once per process, and make sure that it is the one that was sealed.
 
     Parameters
     ----------
     path
         The file.
     promised
-        Its digest in a manifest; ``None``: the one stored beside it counts. Where there is neither there is nothing to compare
-        with.
-
-    Raises
-    ------
-    DataError
-        Its bytes are not those that were sealed, or the stored digest is damaged.
-    """
-    if promised is None and not digest_path(path).exists():
-        return
-    expected, found = promised or stored_digest(path), digest_once(path)
-    if expected != found:
-        raise DataError(
-            f"{path}: expected sha256 {str(expected)[:12]}..., got {found[:12]}...: changed after it was sealed",
-            hint=_AGAIN,
-        )
-
-
-def stored_digest(path: Path) -> str | None:
-    """Digest that was stored when ``path`` was sealed; ``None`` when there is none or it cannot be read."""
-    try:
-        words = digest_path(path).read_text(encoding="ascii").split()
-    except (OSError, UnicodeDecodeError):
-        return None
-    return words[0] if words else None
-
-
-def sealed_digest(path: Path) -> str:
-    """Hash a file and make sure that it is what was sealed.
+        Its digest in a manifest; ``None``: the one stored beside it counts. Without either there is nothing to compare with.
 
     Returns
     -------
-    SHA-256 of its bytes; without a stored digest there is nothing to compare with.
+    SHA-256 of its bytes, hexadecimal.
 
     Raises
     ------
     DataError
-        When the file cannot be read, or its bytes are not those that were sealed.
+        The file cannot be read, or its bytes are not those that were sealed.
     """
-    stored = stored_digest(path)
+    expected = promised or stored_digest(path)
     try:
         found = digest_once(path)
     except OSError as err:
         raise DataError(f"{path}: cannot be read: {err}") from err
-    if stored not in (None, found):
+    if expected not in (None, found):
         raise DataError(
-            f"{path}: expected sha256 {str(stored)[:12]}..., got {found[:12]}...: changed after it was sealed",
-            hint=_AGAIN,
+            f"{path}: expected sha256 {str(expected)[:12]}..., got {found[:12]}...: changed after it was sealed",
+            hint="restore it from a copy, or delete it and run the same command again",
         )
     return found
 
 
-def digest_text(path: Path, digest: str) -> str:
-    """Content of :func:`digest_path`, as ``sha256sum -c`` reads it."""
-    return f"{digest}  {path.name}\n"
+def verify(path: Path, promised: str | None = None) -> None:
+    """Raise what :func:`sealed_digest` raises; a file without any digest is not read, a garbled digest is one that differs."""
+    if promised is None and digest_path(path).exists():
+        promised = stored_digest(path) or "unreadable"
+    if promised is not None:
+        sealed_digest(path, promised)
 
 
 def fsync(path: Path) -> None:

@@ -6,12 +6,19 @@
         raw = shard.raw(view=3, frame=0)               # (8, 180, 240)
         gt = shard.ground_truth(view=3, scale=2)       # depth, normals, mask at 360 x 480
         good = gt.mask == 0
+
+    with ShardWriter(path, scene, rig, tof_info, stereo_info, views=25) as shard:
+        for sample in samples:
+            shard.add(sample)
+        digest = shard.seal(provenance)
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -23,24 +30,109 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError, FormatError
-from tofcapture.files.hdf import Array, attr, json_attr, open_checked, text_attr
-from tofcapture.files.info import stereo_from, tof_from
-from tofcapture.files.layout import SHARD, SHARD_1
-from tofcapture.files.maps import ExactMaps, Float32, GroundTruth, Sample, TofMaps
-from tofcapture.files.seal import remember, remembered, verify
-from tofcapture.frames import StereoInfo, TofInfo
+from tofcapture.files.hdf import DAMAGES, Array, create, json_attr, open_checked, text_attr, write_attrs
+from tofcapture.files.info import stereo_from, stereo_table, tof_from, tof_table
+from tofcapture.files.layout import SHARD
+from tofcapture.files.seal import partial_path, remember, remembered, seal, verify
+from tofcapture.files.view import check_scene_name
+from tofcapture.frames import StereoInfo, TofFlag, TofInfo
 from tofcapture.ops.normals import normals_from_depth
 from tofcapture.poses import Float64
-from tofcapture.rig import Rig, loads_rig
+from tofcapture.rig import Rig, dumps_rig, loads_rig
 
-__all__ = ["ExactMaps", "GroundTruth", "Sample", "Scale", "ShardReader", "TofMaps"]
-
+Float32 = NDArray[np.float32]
 Scale = Literal[1, 2, 4]
-_CHECK = "tofcapture check says what is damaged"
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """Stereo ground truth on the ToF plane at one scale.
+
+    Attributes
+    ----------
+    depth
+        (sH, sW) float32, metres; NaN exactly where the mask says ``NOT_HIT``.
+    normals
+        (sH, sW, 3) float32, ToF frame, unit, facing the camera; NaN where depth is.
+    mask
+        (sH, sW) uint8, bits of :class:`tofcapture.files.layout.MaskBit`; 0 is good ground truth.
+    """
+
+    depth: Float32
+    normals: Float32
+    mask: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class TofMaps:
+    """The sensor's own answer for a burst, averaged as I and Q.
+
+    Attributes
+    ----------
+    depth
+        (H, W) float32, metres; NaN: none.
+    confidence
+        (H, W) float32, amplitude of the highest frequency, raw units.
+    flags
+        (H, W) uint8, bits of :class:`tofcapture.frames.TofFlag`; 0 is a good pixel.
+    """
+
+    depth: Float32
+    confidence: Float32
+    flags: NDArray[np.uint8]
+
+    @property
+    def saturated(self) -> NDArray[np.bool_]:
+        """(H, W) bool, a tap of a frame reached saturation."""
+        out: NDArray[np.bool_] = (self.flags & np.uint8(TofFlag.SATURATED)) != 0
+        return out
+
+
+@dataclass(frozen=True)
+class ExactMaps:
+    """What only a simulator knows, on the ToF plane at 2x: depth (2H, 2W), metres, and normals (2H, 2W, 3)."""
+
+    depth: Float32
+    normals: Float32
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One view of a shard: what :func:`tofcapture.dataset.sample.make_sample` makes and the writer stacks.
+
+    Attributes
+    ----------
+    index
+        Number of the view in its recording.
+    raw
+        (F, K, H, W) phase images as the sensor gave them.
+    celsius, time_ns
+        (F,).
+    tof
+        Decoded burst.
+    native_depth
+        (SH, SW) float32, cropped and denoised stereo depth, stereo frame; NaN: none.
+    ground_truth
+        By scale: 1 and 2, and 4 where it is wanted.
+    T_base_tof
+        (4, 4), from the measured joints.
+    truth
+        Only from a simulator.
+    """
+
+    index: int
+    raw: Array
+    celsius: Float64
+    time_ns: NDArray[np.int64]
+    tof: TofMaps
+    native_depth: Float32
+    ground_truth: Mapping[int, GroundTruth]
+    T_base_tof: Float64
+    truth: ExactMaps | None = None
 
 
 def scales_text(scales: Sequence[int]) -> str:
-    """Scales in words: ``1x and 2x``."""
+    """Say scales in words: ``1x and 2x``."""
     *others, last = (f"{scale}x" for scale in scales)
     return f"{', '.join(others)} and {last}"
 
@@ -65,23 +157,20 @@ class ShardReader:
     def __init__(self, path: Path | str, sha256: str | None = None) -> None:
         self.path = Path(path)
         self._sha256 = sha256
+        self._closed()
+
+    def _closed(self) -> None:
         self._file: h5py.File | None = None
         self._datasets: dict[str, h5py.Dataset] = {}
         self._pid = -1
 
     def __getstate__(self) -> dict[str, Any]:
-        fresh: dict[str, Any] = {
-            "path": self.path,
-            "_sha256": self._sha256,
-            "_file": None,
-            "_datasets": {},
-            "_pid": -1,
-        }
-        return {**fresh, "known": remembered(self.path)}
+        return {"path": self.path, "sha256": self._sha256, "known": remembered(self.path)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        remember(state["path"], state.pop("known"))
-        self.__dict__.update(state)
+        remember(state["path"], state["known"])
+        self.path, self._sha256 = state["path"], state["sha256"]
+        self._closed()
 
     def __enter__(self) -> Self:
         return self
@@ -95,14 +184,14 @@ class ShardReader:
         """Close the file; the next use opens it again."""
         if self._file is not None and self._pid == os.getpid():
             self._file.close()
-        self._file, self._datasets = None, {}
+        self._closed()
 
     def _open(self) -> h5py.File:
         if self._file is None or self._pid != os.getpid():
             if self.path.is_file():
                 verify(self.path, self._sha256)
             # A handle that crossed a fork shares its file offset with the parent: leave it alone and open anew.
-            self._file, self._datasets, self._pid = open_checked(self.path, SHARD, SHARD_1), {}, os.getpid()
+            self._file, self._datasets, self._pid = open_checked(self.path, SHARD), {}, os.getpid()
         return self._file
 
     def _dataset(self, name: str) -> h5py.Dataset:
@@ -110,8 +199,10 @@ class ShardReader:
         if name not in self._datasets:
             try:
                 found = file.get(name)
-            except (OSError, RuntimeError, ValueError, KeyError) as err:
-                raise DataError(f"{self.path}: /{name} cannot be opened: {err}", hint=_CHECK) from err
+            except DAMAGES as err:
+                raise DataError(
+                    f"{self.path}: /{name} cannot be opened: {err}", f"tofcapture check {self.path}"
+                ) from err
             if not isinstance(found, h5py.Dataset):
                 raise FormatError(f"{self.path}: expected the dataset /{name}, found none")
             self._datasets[name] = found
@@ -119,23 +210,15 @@ class ShardReader:
 
     def _row(self, name: str, *index: int) -> Array:
         dataset = self._dataset(name)
-        if not (
-            0 <= index[0] < dataset.shape[0]
-            and all(0 <= i < n for i, n in zip(index, dataset.shape, strict=False))
-        ):
+        if not all(0 <= i < n for i, n in zip(index, dataset.shape, strict=False)):
             raise DataError(f"{self.path}: /{name} has shape {dataset.shape}, asked for {index}")
         try:
             return np.asarray(dataset[index])
-        except (OSError, RuntimeError, ValueError) as err:
+        except DAMAGES as err:
             where = f"/{name}{list(index)}"
             raise DataError(
                 f"{self.path}: {where} is damaged: {err}", hint=f"tofcapture check {self.path}"
             ) from err
-
-    @cached_property
-    def version(self) -> int:
-        """Version of the format that the file is of."""
-        return int(attr(self._open(), "version", self.path))
 
     @cached_property
     def scene(self) -> str:
@@ -191,12 +274,7 @@ class ShardReader:
 
     def tof(self, view: int) -> TofMaps:
         """Decoded burst."""
-        return TofMaps(self._row("tof/depth", view), self._row("tof/confidence", view), self.flags(view))
-
-    def flags(self, view: int) -> NDArray[np.uint8]:
-        """(H, W) uint8, bits of :class:`tofcapture.frames.TofFlag`; a shard of version 1 knows of saturation only."""
-        name = "tof/flags" if self.version > SHARD_1.version else "tof/saturated"
-        return self._row(name, view).astype(np.uint8, copy=False)
+        return TofMaps(*(self._row(f"tof/{name}", view) for name in ("depth", "confidence", "flags")))
 
     @cached_property
     def scales(self) -> tuple[Scale, ...]:
@@ -255,3 +333,138 @@ class ShardReader:
     def native_normals(self, view: int) -> Float32:
         """(SH, SW, 3) ground-truth normals at the stereo camera's own resolution, stereo frame."""
         return normals_from_depth(self.native(view), self.rig.stereo).astype(np.float32)
+
+
+def _rows(sample: Sample) -> dict[str, Array]:
+    """One row of every dataset of a shard, by its path."""
+    rows: dict[str, Any] = {
+        "tof/raw": sample.raw,
+        "tof/celsius": sample.celsius,
+        "tof/time_ns": sample.time_ns,
+        "tof/depth": sample.tof.depth,
+        "tof/confidence": sample.tof.confidence,
+        "tof/flags": np.asarray(sample.tof.flags, dtype=np.uint8),
+        "gt/native_depth": sample.native_depth,
+        "views/T_base_tof": sample.T_base_tof,
+        "views/index": np.int64(sample.index),
+    }
+    for scale, gt in sample.ground_truth.items():
+        rows |= {f"gt/{name}_{scale}x": getattr(gt, name) for name in ("depth", "normals", "mask")}
+    if sample.truth is not None:
+        rows |= {"truth/depth_2x": sample.truth.depth, "truth/normals_2x": sample.truth.normals}
+    return {path: np.asarray(row) for path, row in rows.items()}
+
+
+def _digest(row: Array) -> bytes:
+    return hashlib.sha256(np.ascontiguousarray(row).data).digest()
+
+
+class ShardWriter:
+    """Streams samples into ``NAME.h5.partial`` and seals it; left without :meth:`seal`, nothing remains.
+
+    Parameters
+    ----------
+    path
+        Final name of the shard.
+    scene, rig, tof_info, stereo_info
+        Root attributes.
+    views
+        Number of samples that will be added.
+    """
+
+    def __init__(
+        self, path: Path, scene: str, rig: Rig, tof_info: TofInfo, stereo_info: StereoInfo, views: int
+    ) -> None:
+        self._path, self._scene = Path(path), check_scene_name(scene)
+        self._rig, self._tof, self._stereo = rig, tof_info, stereo_info
+        self._views = views
+        self._written: dict[str, list[bytes]] = {}  # digests of the rows, by dataset
+        self._added = 0
+        self._partial = partial_path(self._path)
+        self._file: h5py.File | None = None
+
+    def __enter__(self) -> Self:
+        self._file = h5py.File(self._partial, "w")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._file is not None:
+            self._file.close()
+        self._partial.unlink(missing_ok=True)
+
+    def _create(self, file: h5py.File, rows: Mapping[str, Array]) -> None:
+        F, K = rows["tof/raw"].shape[:2]
+        (H, W), (SH, SW) = self._rig.tof.shape, self._rig.stereo.shape
+        sizes = {"N": self._views, "F": F, "K": K, "H": H, "W": W, "SH": SH, "SW": SW}
+        for field in SHARD:
+            if field.path in rows:
+                create(file, field, field.shape(sizes), rows[field.path].dtype)
+                self._written[field.path] = []
+            elif not field.optional:
+                raise FormatError(f"sample: expected /{field.path}, got none")
+
+    def add(self, sample: Sample) -> None:
+        """Append one sample.
+
+        Raises
+        ------
+        FormatError
+            A row is missing, or its shape or dtype is not the shard's.
+        """
+        if self._file is None or self._added >= self._views:
+            raise FormatError(f"{self._path}: expected {self._views} samples in an open writer, got one more")
+        rows = _rows(sample)
+        if not self._added:
+            self._create(self._file, rows)
+        if rows.keys() != self._written.keys():
+            raise FormatError(
+                f"{self._path}: samples disagree on {sorted(rows.keys() ^ self._written.keys())}"
+            )
+        for name, row in rows.items():
+            dataset = self._file[name]
+            if row.shape != dataset.shape[1:] or row.dtype != dataset.dtype:
+                got = f"{row.dtype} {row.shape}"
+                raise FormatError(
+                    f"/{name}: expected {dataset.dtype} {dataset.shape[1:]} per view, got {got}"
+                )
+            dataset[self._added] = row
+            dataset.flush()  # now, not when the last handle goes, which a debugger or profiler may hold: the same bytes
+            self._written[name].append(_digest(row))
+        self._added += 1
+
+    def seal(self, provenance: Mapping[str, Any]) -> str:
+        """Write the attributes, verify every row, make the shard permanent.
+
+        Returns
+        -------
+        SHA-256 of the file, hexadecimal.
+
+        Raises
+        ------
+        FormatError
+            Fewer samples were added than promised.
+        DataError
+            What was read back is not what was written.
+        """
+        if self._file is None or self._added != self._views:
+            raise FormatError(f"{self._path}: expected {self._views} samples, got {self._added}")
+        attrs = {
+            "scene": self._scene,
+            "rig": dumps_rig(self._rig),
+            "tof_info": tof_table(self._tof),
+            "stereo_info": stereo_table(self._stereo),
+            "provenance": dict(provenance),
+        }
+        write_attrs(self._file, SHARD, attrs)
+        self._file.close()
+        self._file = None
+        with open_checked(self._partial, SHARD) as file:
+            for name, digests in self._written.items():
+                if any(_digest(file[name][i]) != digest for i, digest in enumerate(digests)):
+                    raise DataError(
+                        f"{self._path}: /{name} read back differs from what was written",
+                        hint="check the disk",
+                    )
+        return seal(self._partial, self._path)

@@ -19,17 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError, DataError, FormatError, TofError
-from tofcapture.files.chunks import ChunkWriter
 from tofcapture.files.hdf import Array, attr, create, fetch, json_attr, open_checked, text_attr, write_attrs
 from tofcapture.files.info import stereo_from, stereo_table, tof_from, tof_table
-from tofcapture.files.layout import VIEW, Field
+from tofcapture.files.layout import VIEW
 from tofcapture.files.seal import partial_path, seal
 from tofcapture.frames import ArmState, StereoFrame, TofBurst, Truth, View
 from tofcapture.rig import dumps_rig, loads_rig
 
-_GZIP = 1  # a view is written while the arm waits
-_POINTS = "stereo/points"
 _SCENE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_TRUTH = ("depth", "normals", "target", "T_tof_stereo", "T_flange_tof")
 
 
 def check_scene_name(scene: str) -> str:
@@ -66,32 +64,8 @@ def _arrays(view: View) -> dict[str, Array]:
         arrays[f"arm/{when}/T_base_flange"] = np.asarray(state.T_base_flange, dtype=np.float64)
         arrays[f"arm/{when}/time_ns"] = np.int64(state.time_ns)
     if view.truth is not None:
-        for name in ("depth", "normals", "target", "T_tof_stereo", "T_flange_tof"):
-            arrays[f"truth/{name}"] = getattr(view.truth, name)
+        arrays |= {f"truth/{name}": getattr(view.truth, name) for name in _TRUTH}
     return {path: np.asarray(a) for path, a in arrays.items()}
-
-
-def _sizes(view: View) -> dict[str, int]:
-    F, K, H, W = view.tof.raw.shape
-    SH, SW = view.stereo.info.camera.shape
-    return {"F": F, "K": K, "H": H, "W": W, "SH": SH, "SW": SW}
-
-
-def _put(file: h5py.File, field: Field, data: Array, sizes: dict[str, int]) -> None:
-    if data.shape != field.shape(sizes):
-        raise FormatError(f"/{field.path}: expected shape {field.shape(sizes)}, got {data.shape}")
-    # One coordinate per chunk: x, y and z each pack better alone, and depth is read without the others.
-    chunks = (*data.shape[:-1], 1) if field.path == _POINTS else None
-    ChunkWriter().put(create(file, field, data.shape, data.dtype, _GZIP, chunks), data)
-
-
-def _verify(path: Path, arrays: dict[str, Array]) -> None:
-    with open_checked(path, VIEW) as file:
-        for name, data in arrays.items():
-            if fetch(file, VIEW[name], path).tobytes() != data.tobytes():
-                raise DataError(
-                    f"{path}: /{name} read back differs from what was written", hint="check the disk"
-                )
 
 
 def write_view(path: Path, view: View) -> str:
@@ -121,8 +95,26 @@ def write_view(path: Path, view: View) -> str:
     """
     path = Path(path)
     check_scene_name(view.scene)
-    arrays, sizes, partial = _arrays(view), _sizes(view), partial_path(path)
-    attrs = {
+    arrays, partial = _arrays(view), partial_path(path)
+    try:
+        with h5py.File(partial, "w") as file:
+            _write(file, view, arrays)
+        with open_checked(partial, VIEW) as file:
+            for name, data in arrays.items():
+                if fetch(file, VIEW[name], path).tobytes() != data.tobytes():
+                    raise DataError(
+                        f"{path}: /{name} read back differs from what was written", hint="check the disk"
+                    )
+        return seal(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _write(file: h5py.File, view: View, arrays: dict[str, Array]) -> None:
+    F, K, H, W = view.tof.raw.shape
+    SH, SW = view.stereo.info.camera.shape
+    sizes = {"F": F, "K": K, "H": H, "W": W, "SH": SH, "SW": SW}
+    values = {
         "scene": view.scene,
         "index": view.index,
         "rig": dumps_rig(view.rig),
@@ -130,15 +122,12 @@ def write_view(path: Path, view: View) -> str:
         "stereo_info": stereo_table(view.stereo.info),
         "provenance": dict(view.provenance),
     }
-    try:
-        with h5py.File(partial, "w") as file:
-            write_attrs(file, VIEW, attrs)
-            for name, data in arrays.items():
-                _put(file, VIEW[name], data, sizes)
-        _verify(partial, arrays)
-        return seal(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_attrs(file, VIEW, values)
+    for name, data in arrays.items():
+        expected = VIEW[name].shape(sizes)
+        if data.shape != expected:
+            raise FormatError(f"/{name}: expected shape {expected}, got {data.shape}")
+        create(file, VIEW[name], data.shape, data.dtype)[...] = data
 
 
 def read_view(path: Path) -> View:
@@ -153,7 +142,7 @@ def read_view(path: Path) -> View:
     """
     path = Path(path)
     with _opened(path) as file:
-        return _read(file, path, fetch(file, VIEW[_POINTS], path))
+        return _read(file, path, fetch(file, VIEW["stereo/points"], path))
 
 
 def read_depth_view(path: Path) -> tuple[View, NDArray[np.float32]]:
@@ -173,7 +162,7 @@ def read_depth_view(path: Path) -> tuple[View, NDArray[np.float32]]:
     """
     path = Path(path)
     with _opened(path) as file:
-        depth = fetch(file, VIEW[_POINTS], path, np.s_[..., 2])
+        depth = fetch(file, VIEW["stereo/points"], path, np.s_[..., 2])
         return _read(file, path, np.broadcast_to(np.float32(np.nan), (*depth.shape, 3))), depth
 
 
@@ -209,10 +198,5 @@ def _read(file: h5py.File, path: Path, points: NDArray[np.float32]) -> View:
         arm_after=arm("after"),
         rig=loads_rig(text_attr(file, "rig", path), f"{path}: rig"),
         provenance=json_attr(file, "provenance", path),
-        truth=_truth(file, path) if "truth" in file else None,
+        truth=Truth(**{name: get(f"truth/{name}") for name in _TRUTH}) if "truth" in file else None,
     )
-
-
-def _truth(file: h5py.File, path: Path) -> Truth:
-    names = ("depth", "normals", "target", "T_tof_stereo", "T_flange_tof")
-    return Truth(**{name: fetch(file, VIEW[f"truth/{name}"], path) for name in names})

@@ -17,10 +17,9 @@ from torch.utils.data import Dataset
 
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
-from tofcapture.files.cache import open_cache
+from tofcapture.files.cache import PackedScene, open_cache
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import load_manifest
-from tofcapture.files.packed import PackedScene
 from tofcapture.files.shard import ShardReader
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoder, TapNoise, frequencies, photon_transfer

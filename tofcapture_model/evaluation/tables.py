@@ -119,7 +119,7 @@ def cells(results: Mapping[str, Any], suite: Suite) -> list[tuple[str, list[tupl
     named = {name for one in SUITES.values() for name in one.rows if suite.rows}
     others = [name for name in found if suite.others and name not in named]
     methods = {name: found[name] for name in (*suite.rows, *others) if name in found}
-    columns = [_column(methods, results.get("spread", {}), c) for c in suite.columns]
+    columns = [column_cells(methods, results.get("spread", {}), c) for c in suite.columns]
     return [(suite.rows.get(name, name), [column[i] for column in columns]) for i, name in enumerate(methods)]
 
 
@@ -134,9 +134,11 @@ RANKS: Mapping[str, Callable[[float], float]] = {
 """What is smallest for the best value of a column; NaN where none is better."""
 
 
-def _column(methods: Mapping[str, Any], spread: Mapping[str, Any], column: Column) -> list[tuple[str, bool]]:
-    values = [_value(table, column) for table in methods.values()]
-    # what looks equal in print is equal
+def column_cells(
+    methods: Mapping[str, Any], spread: Mapping[str, Any], column: Column
+) -> list[tuple[str, bool]]:
+    """Text of a column for every method, and whether it is the best; what looks equal in print is equal."""
+    values = [value_of(table, column) for table in methods.values()]
     ranks = [math.nan if v is None else RANKS[column.best](round(v, column.digits)) for v in values]
     known = [r for r in ranks if not math.isnan(r)]
     out = []
@@ -144,13 +146,14 @@ def _column(methods: Mapping[str, Any], spread: Mapping[str, Any], column: Colum
         if value is None:
             out.append(("–", False))
             continue
-        other = _value(spread.get(name, {}), column)
+        other = value_of(spread.get(name, {}), column)
         text = f"{value:.{column.digits}f}" + ("" if other is None else f" ± {other:.{column.digits}f}")
         out.append((text, len(known) > 1 and rank == min(known)))
     return out
 
 
-def _value(table: Any, column: Column) -> float | None:
+def value_of(table: Any, column: Column) -> float | None:
+    """Value of a method's results in the printed unit; None where it is absent."""
     for key in column.path:
         table = table.get(key) if isinstance(table, Mapping) else None
     return column.factor * float(table) if isinstance(table, int | float) and math.isfinite(table) else None

@@ -21,7 +21,7 @@ from tofcapture.viz.charts import chart, draw_rig, lines
 from tofcapture_model.config import dumps_config
 from tofcapture_model.report.examples import choose, load_examples
 from tofcapture_model.report.panels import panels
-from tofcapture_model.report.scores import headline, sample, tables, tiles
+from tofcapture_model.report.scores import POOLS, headline, sample, tables, tiles
 from tofcapture_model.report.sources import Network, Sources, doubts
 
 _SAME_DEG, _SAME_MM = 1e-6, 1e-6
@@ -39,6 +39,7 @@ def content(sources: Sources, views: int) -> dict[str, Any]:
         "sample": sample(results) if results else "",
         "tiles": tiles(results) if results else [],
         "results": results,
+        "pools": list(POOLS.values()),
         "tables": tables(results) if results else [],
         "evidence": sources.evidence,
         "shard": shard,
@@ -95,18 +96,15 @@ def _rig(shard: Mapping[str, Any], evidence: Mapping[str, Any] | None) -> dict[s
         ],
         "illuminator": ", ".join(f"{1e3 * x:.1f}" for x in rig.illuminator),
         "ranges": [_range_error(error) for error in shard["tof"].range_errors],
-        "drawings": [
-            (
-                chart(
-                    lambda axes, a=across: draw_rig(axes, rig, a, 2),
-                    f"flange and cameras {words}",
-                    size=(5.6, 3.6),
-                ),
-                words,
-            )
-            for across, words in _SIDES
-        ],
+        "drawings": [(_drawing(rig, across, words), words) for across, words in _SIDES],
     }
+
+
+def _drawing(rig: Rig, across: int, words: str) -> str:
+    def draw(axes: Any) -> None:
+        draw_rig(axes, rig, across, 2)
+
+    return chart(draw, f"flange and cameras {words}", size=(5.6, 3.6))
 
 
 def _told(T: Float64) -> tuple[str, str]:

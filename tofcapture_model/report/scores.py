@@ -1,123 +1,76 @@
-"""``results.json`` as tables: lengths in millimetres, the better value marked."""
+"""Lay ``results.json`` out as tables, a headline and tiles: lengths in millimetres, the better value marked."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
+from tofcapture_model.evaluation.tables import RANKS, Column, column_cells, value_of
 from tofcapture_model.report.panels import METHOD_TITLES
 
 POOLS = {"pixel": "all pixels pooled", "image": "mean over images"}
-
-
-@dataclass(frozen=True)
-class Column:
-    """A metric: its key, its words, its unit, what turns it into that unit, whether less or more is better."""
-
-    key: str
-    words: str
-    unit: str
-    factor: float
-    better: str  # less, more, nearer (to zero), or nothing
-    digits: int = 2
-
-
 DEPTH = (
-    Column("mae", "MAE (mean absolute error)", "mm", 1e3, "less"),
-    Column("median", "median absolute error", "mm", 1e3, "less"),
-    Column("rmse", "RMSE (root mean square)", "mm", 1e3, "less"),
-    Column("bias", "mean signed error", "mm", 1e3, "nearer"),
-    Column("sq", "SQ (square over depth)", "mm", 1e3, "less", 3),
-    Column("abs", "ABS (relative error)", "%", 100, "less"),
-    *(Column(f"within_{t}mm", f"within {t} mm", "%", 100, "more", 1) for t in (5, 10, 20, 50)),
-    Column("delta_1", "ratio below 1.25", "%", 100, "more", 1),
-    Column("coverage", "measured, not filled in", "%", 100, "", 1),
+    Column("MAE (mean absolute error), mm", ("mae",)),
+    Column("median absolute error, mm", ("median",)),
+    Column("RMSE (root mean square), mm", ("rmse",)),
+    Column("mean signed error, mm", ("bias",)),
+    Column("SQ (square over depth), mm", ("sq",), digits=3),
+    Column("ABS (relative error), %", ("abs",), 100),
+    *(Column(f"within {t} mm, %", (f"within_{t}mm",), 100, 1, "most") for t in (5, 10, 20, 50)),
+    Column("ratio below 1.25, %", ("delta_1",), 100, 1, "most"),
+    Column("measured, not filled in, %", ("coverage",), 100, 1, "none"),
 )
 NORMAL = (
-    Column("mean_deg", "mean angle", "deg", 1, "less"),
-    Column("median_deg", "median angle", "deg", 1, "less"),
-    Column("rmse_deg", "RMS angle", "deg", 1, "less"),
-    *(Column(f"within_{t}deg", f"within {t} deg", "%", 100, "more", 1) for t in ("5", "11.25", "20", "30")),
+    Column("mean angle, deg", ("mean_deg",), 1),
+    Column("median angle, deg", ("median_deg",), 1),
+    Column("RMS angle, deg", ("rmse_deg",), 1),
+    *(Column(f"within {t} deg, %", (f"within_{t}deg",), 100, 1, "most") for t in ("5", "11.25", "20", "30")),
 )
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One number as text, and whether it is the best of its pool."""
-
-    text: str
-    best: bool
-
-
-@dataclass(frozen=True)
-class Row:
-    """One metric: words, unit, one cell for every (pool, method)."""
-
-    words: str
-    unit: str
-    cells: list[Cell]
+_TILES = (
+    ("depth error, mean", "mm", "depth", DEPTH[0]),
+    ("depth error, median", "mm", "depth", DEPTH[1]),
+    ("depth within 10 mm", "%", "depth", DEPTH[7]),
+    ("normals, mean error", "deg", "normal", NORMAL[0]),
+)
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table: title, (pool, number of methods) over the columns, methods below, rows."""
+    """A table: title, titles of the methods, rows of words and a cell (text, best of its pool) for each pool and method."""
 
     title: str
-    pools: list[tuple[str, int]]
     methods: list[str]
-    rows: list[Row]
-
-
-def method_title(name: str) -> str:
-    """How a method is called on the page."""
-    return METHOD_TITLES.get(name, name)
+    rows: list[tuple[str, list[tuple[str, bool]]]]
 
 
 def tables(results: Mapping[str, Any]) -> list[Table]:
-    """Both tables of a ``results.json``; metrics that it does not hold are left out."""
-    return [_table(results, "Depth", "depth", DEPTH), _table(results, "Normals", "normal", NORMAL)]
+    """Lay out both tables of a ``results.json``; metrics that it does not hold are left out."""
+    found, spread = results["methods"], results.get("spread", {})
+    out = []
+    for title, kind, columns in (("Depth", "depth", DEPTH), ("Normals", "normal", NORMAL)):
+        rows = []
+        for column in columns:
+            cells = [
+                cell
+                for pool in POOLS
+                for cell in _marked(column_cells(found, spread, _in(column, kind, pool)))
+            ]
+            if any(text != "–" for text, _ in cells):
+                rows.append((column.words, cells))
+        out.append(Table(title, [METHOD_TITLES.get(name, name) for name in found], rows))
+    return out
 
 
-def _table(results: Mapping[str, Any], title: str, kind: str, columns: tuple[Column, ...]) -> Table:
-    methods = list(results["methods"])
-    rows = []
-    for column in columns:
-        cells = [cell for pool in POOLS for cell in _cells(results, kind, pool, column)]
-        if any(c.text != "–" for c in cells):
-            rows.append(Row(column.words, column.unit, cells))
-    heads = [(words, len(methods)) for words in POOLS.values()]
-    return Table(title, heads, [method_title(m) for m in methods] * len(POOLS), rows)
+def _in(column: Column, kind: str, pool: str = "pixel") -> Column:
+    return replace(column, path=(kind, pool, *column.path))
 
 
-def _cells(results: Mapping[str, Any], kind: str, pool: str, column: Column) -> list[Cell]:
-    values = [value_of(table, kind, pool, column) for table in results["methods"].values()]
-    ranks = [None if v is None else _rank(round(v, column.digits), column.better) for v in values]
-    best = min((r for r in ranks if r is not None), default=None)
-    alone = len(ranks) > 1 and ranks.count(best) == 1
-    return [
-        Cell(shown(v, column), alone and r is not None and r == best)
-        for v, r in zip(values, ranks, strict=True)
-    ]
-
-
-def value_of(method: Mapping[str, Any], kind: str, pool: str, column: Column) -> float | None:
-    """Value of a metric in the unit of its column; None where it is absent."""
-    value = method.get(kind, {}).get(pool, {}).get(column.key)
-    return None if value is None or not math.isfinite(value) else column.factor * float(value)
-
-
-def shown(value: float | None, column: Column) -> str:
-    """Print a number, or a dash."""
-    return "–" if value is None else f"{value:.{column.digits}f}"
-
-
-def _rank(value: float, better: str) -> float | None:
-    """Smaller is better; what looks equal in print is equal."""
-    if not better:
-        return None
-    return {"less": value, "more": -value, "nearer": abs(value)}[better]
+def _marked(cells: Sequence[tuple[str, bool]]) -> list[tuple[str, bool]]:
+    """Take the marks off where several are the best: equal print is no win."""
+    alone = sum(best for _, best in cells) == 1
+    return [(text, best and alone) for text, best in cells]
 
 
 def networks(results: Mapping[str, Any]) -> list[str]:
@@ -128,10 +81,9 @@ def networks(results: Mapping[str, Any]) -> list[str]:
 
 
 def headline(results: Mapping[str, Any]) -> str:
-    """What becomes of the sensor's error: a sentence for every network."""
-    where = f"On {sample(results)}"
+    """Say in a sentence for every network what becomes of the sensor's error."""
     told = " ".join(filter(None, (_compared(results, name) for name in networks(results))))
-    return f"{where}, {told}" if told else f"{where}: there is nothing to compare."
+    return f"On {sample(results)}, {told}" if told else f"On {sample(results)}: there is nothing to compare."
 
 
 def _compared(results: Mapping[str, Any], name: str) -> str:
@@ -147,15 +99,9 @@ def _compared(results: Mapping[str, Any], name: str) -> str:
     )
 
 
-def sample(results: Mapping[str, Any]) -> str:
-    """Say how many views of how many scenes were measured."""
-    kind = "held-out scene" if results["split"] == "test" else f"{results['split']} scene"
-    return f"{_count(results.get('views'), 'view')} of {_count(len(results.get('scenes', [])), kind)}"
-
-
 def _two(results: Mapping[str, Any], method: str) -> tuple[Any, Any]:
     table = results["methods"].get(method, {})
-    return value_of(table, "depth", "pixel", DEPTH[0]), value_of(table, "normal", "pixel", NORMAL[0])
+    return value_of(table, _in(DEPTH[0], "depth")), value_of(table, _in(NORMAL[0], "normal"))
 
 
 def _change(before: float, after: float) -> str:
@@ -165,38 +111,28 @@ def _change(before: float, after: float) -> str:
     return f"{abs(percent):.0f} % {'more' if percent > 0 else 'less'}"
 
 
+def sample(results: Mapping[str, Any]) -> str:
+    """Say how many views of how many scenes were measured."""
+    kind = "held-out scene" if results["split"] == "test" else f"{results['split']} scene"
+    return f"{_count(results.get('views'), 'view')} of {_count(len(results.get('scenes', [])), kind)}"
+
+
 def _count(number: object, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def tiles(results: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """(what, number with unit, whose it is and the sensor's) of the main metrics, pooled over pixels; of several networks the best."""
+    """(what, number with unit, whose it is and the sensor's) of the main metrics over all pixels; of several networks the best."""
     names = networks(results)
-    if not names:
-        return []
-    wanted = [
-        ("depth error, mean", "depth", DEPTH[0]),
-        ("depth error, median", "depth", DEPTH[1]),
-        ("depth within 10 mm", "depth", DEPTH[7]),
-        ("normals, mean error", "normal", NORMAL[0]),
-    ]
     out = []
-    for title, kind, column in wanted:
-        values = {
-            m: value_of(results["methods"].get(m, {}), kind, "pixel", column) for m in (*names, "sensor")
-        }
-        best = min(names, key=lambda m: _order(values[m], column))
-        ours, theirs = shown(values[best], column), shown(values["sensor"], column)
-        out.append((title, f"{ours} {column.unit}", f"{_whose(best, names)}sensor {theirs} {column.unit}"))
+    for title, unit, kind, column in _TILES if names else ():
+        found = {m: value_of(results["methods"].get(m, {}), _in(column, kind)) for m in (*names, "sensor")}
+        rank = {m: math.inf if v is None else RANKS[column.best](v) for m, v in found.items()}
+        best = min(names, key=lambda m: rank[m])
+        ours, theirs = (
+            "–" if v is None else f"{v:.{column.digits}f}" for v in (found[best], found["sensor"])
+        )
+        whose = "" if best == "model" else f"{best}; "
+        whose = f"{best}, best of {len(names)}; " if len(names) > 1 else whose
+        out.append((title, f"{ours} {unit}", f"{whose}sensor {theirs} {unit}"))
     return out
-
-
-def _order(value: float | None, column: Column) -> float:
-    rank = None if value is None else _rank(value, column.better)
-    return math.inf if rank is None else rank
-
-
-def _whose(name: str, names: list[str]) -> str:
-    if len(names) > 1:
-        return f"{name}, best of {len(names)}; "
-    return "" if name == "model" else f"{name}; "

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.colours import GROUND_TRUTH, REMOVED, SENSOR
-from tofcapture.dataset.sample import SampleConfig, calibrated, check_cameras, decode_burst, find_object
+from tofcapture.dataset.sample import SampleConfig, check_cameras, decoder_for, find_object
 from tofcapture.errors import DataError
 from tofcapture.files.view import read_view
 from tofcapture.frames import View
@@ -107,8 +107,8 @@ def preprocess(view: View, rig: Rig) -> Steps:
         The rig is of other cameras, or nothing is left.
     """
     check_cameras(view, rig)
-    depth = decode_burst(view.tof, calibrated(view.tof.info, rig)).depth
-    tof = rig.tof.unproject(np.where(depth < _CONFIG.far, depth, np.nan))
+    decoded = decoder_for(view, rig).burst(view.tof.raw, float(np.mean(view.tof.celsius)))
+    tof = rig.tof.unproject(np.where(decoded.depth < _CONFIG.far, decoded.depth, np.nan))
     measured = np.ascontiguousarray(view.stereo.points[..., 2])
     clean = denoise(measured, rig.stereo)
     native = np.where(clean, measured, np.float32(np.nan))

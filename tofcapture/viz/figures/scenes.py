@@ -14,8 +14,7 @@ from tofcapture.camera import Camera
 from tofcapture.colours import ESTIMATE, GROUND_TRUTH, SENSOR, Scale, paint_normals, scale_for
 from tofcapture.errors import DataError, UsageError
 from tofcapture.files.manifest import load_manifest
-from tofcapture.files.maps import GroundTruth
-from tofcapture.files.shard import ShardReader
+from tofcapture.files.shard import GroundTruth, ShardReader
 from tofcapture.poses import Float64
 from tofcapture.viz.figures.clouds import eye_for, splat
 from tofcapture.viz.sharded import read_maps

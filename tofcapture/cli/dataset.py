@@ -1,0 +1,134 @@
+"""``tofcapture check``, ``pack`` and ``export-dataset``: what is done with a dataset besides training."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from tofcapture.cli.kit import progress
+from tofcapture.command import Command, Outcome
+from tofcapture.errors import ConfigError
+
+
+def _configure_check(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "path", type=Path, metavar="PATH", help="view file, shard, recording, dataset or cache"
+    )
+
+
+def _check(args: argparse.Namespace) -> Outcome:
+    from tofcapture.files.check import check
+
+    path: Path = args.path
+    if not path.exists():
+        raise ConfigError(
+            f"{path}: expected a file or folder, found nothing there", hint="tofcapture check PATH"
+        )
+    total = sum(1 for _ in path.rglob("*.h5")) or 1
+    counted: list[Path] = []
+    with progress() as report:
+
+        def tell(file: Path) -> None:
+            report("check", len(counted), total, str(file))
+            counted.append(file)
+
+        problems = check(path, tell)
+    rows = [{"path": str(p.path), "where": p.where, "message": p.message, "hint": p.hint} for p in problems]
+    lines = [line for p in problems for line in (str(p), f"  try: {p.hint}" if p.hint else "") if line]
+    verdict = f"{len(problems)} problems" if problems else "ok"
+    lines.append(f"{path}: {len(counted)} files, {verdict}")
+    data = {"path": str(path), "ok": not problems, "files": len(counted), "problems": rows}
+    return Outcome(data, "\n".join(lines), exit_code=5 if problems else 0)
+
+
+def _configure_pack(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that build-dataset filled")
+    parser.add_argument("--split", default="train", help="train, val or test (default train)")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="CACHE", help="the cache's folder; completed if it exists"
+    )
+
+
+def _pack(args: argparse.Namespace) -> Outcome:
+    from tofcapture.files.cache import pack
+    from tofcapture.files.manifest import load_manifest
+
+    total = sum(entry.views for entry in load_manifest(args.dataset).split(args.split).values())
+    done = 0
+    with progress() as report:
+
+        def tell(scene: str, view: int, views: int) -> None:
+            nonlocal done
+            done += 1
+            report("pack", done, total, f"{scene}: view {view} of {views}")
+
+        scenes = pack(args.dataset, args.split, args.out, tell)
+    size = sum(scene.path.stat().st_size for scene in scenes.values())
+    data = {"cache": str(args.out), "scenes": len(scenes), "views": total, "packed": done, "bytes": size}
+    text = f"{args.out}: {total} views of {len(scenes)} scenes, {size / 1e9:.2f} GB, {done} views packed now"
+    return Outcome(data, text)
+
+
+def _configure_export(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("path", type=Path, metavar="PATH", help="dataset or shard")
+    parser.add_argument("--format", required=True, choices=("ply", "png16", "mcap"), dest="kind")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder; completed if it was begun"
+    )
+    parser.add_argument(
+        "--unit",
+        type=float,
+        default=1 / 8000,
+        metavar="METRES",
+        help="step of PNG depth (default 0.000125: up to 8.19 m; 0.0001 holds 6.55 m)",
+    )
+
+
+def _export(args: argparse.Namespace) -> Outcome:
+    from tofcapture.dataset.export import export
+
+    start = time.monotonic()
+    with progress() as report:
+        result = export(
+            args.path,
+            args.kind,
+            args.out,
+            unit=args.unit,
+            progress=lambda scene, done, total: report("export", done, total, scene),
+        )
+    seconds = time.monotonic() - start
+    data = {
+        "out": str(args.out),
+        "format": args.kind,
+        "scenes": list(result.scenes),
+        "written": list(result.written),
+        "files": result.files,
+        "bytes": result.size,
+        "seconds": round(seconds, 2),
+    }
+    text = (
+        f"{args.out}: {result.files} files of {len(result.scenes)} scenes, {result.size / 1e6:.2f} MB; "
+        f"{len(result.written)} scenes written in {seconds:.1f} s"
+    )
+    return Outcome(data, text)
+
+
+CHECK = Command(
+    help="list every problem of a view, a shard, a recording, a dataset or a cache",
+    example="tofcapture check datasets/first",
+    configure=_configure_check,
+    run=_check,
+)
+PACK = Command(
+    help="pack one split of a dataset into flat files that training maps into memory",
+    example="tofcapture pack datasets/first --split train --out cache",
+    configure=_configure_pack,
+    run=_pack,
+)
+EXPORT = Command(
+    help="export a dataset or a shard as point clouds, 16-bit PNG depth or MCAP",
+    example="tofcapture export-dataset datasets/first --format ply --out clouds",
+    configure=_configure_export,
+    run=_export,
+)
