@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
+from tests.sealed import delete, edit, replaced, reseal, set_attr
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError, FormatError
 from tofcapture.files.hdf import open_checked
@@ -214,6 +215,45 @@ def test_reading_what_is_not_there(tmp_path):
         file["x"] = 1
     with pytest.raises(FormatError, match="format"):
         ShardReader(tmp_path / "foreign.h5").scene  # noqa: B018
+
+
+def garble_a_chunk(path):
+    with h5py.File(path) as file:
+        at = file["gt/depth_2x"].id.get_chunk_info(1).byte_offset
+    data = bytearray(path.read_bytes())
+    data[at + 30] ^= 1
+    path.write_bytes(data)
+
+
+WRONG = {
+    "attribute gone": (lambda f: f.attrs.__delitem__("tof_info"), "the attribute 'tof_info', cannot read it"),
+    "attribute no text": (set_attr("tof_info", 3), "the attribute 'tof_info' to be text, got int"),
+    "attribute no JSON": (set_attr("tof_info", "{"), "'tof_info' is not JSON"),
+    "no camera": (set_attr("tof_info", "{}"), "tof_info does not describe a ToF camera: KeyError"),
+    "no stereo camera": (set_attr("stereo_info", "{}"), "stereo_info does not describe a stereo camera"),
+    "rig": (set_attr("rig", "units = 'mm'"), "rig"),
+    "dataset gone": (delete("gt/depth_2x"), "expected the dataset /gt/depth_2x, found none"),
+    "dtype": (replaced("gt/depth_2x", np.ones((2, 12, 16))), "/gt/depth_2x: expected float32, got float64"),
+    "chunk": (garble_a_chunk, r"/gt/depth_2x\[1\] is damaged"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_errors_of_the_reader_name_file_and_place(tmp_path, case):
+    """Whatever is wrong in a file whose digest is right, the message says where; nothing is guessed."""
+    change, said = WRONG[case]
+    path = tmp_path / "mug.h5"
+    write(path)
+    if case == "chunk":
+        path.chmod(0o644)
+        change(path)
+        reseal(path)
+    else:
+        edit(path, change)
+    with pytest.raises(DataError, match=said) as caught, ShardReader(path) as shard:
+        _ = shard.info, shard.stereo_info, shard.rig, shard.ground_truth(1, 2)
+    assert str(path) in caught.value.message
+    assert isinstance(caught.value, FormatError) == (case != "chunk")
 
 
 def test_manifest_round_trip_and_validation(tmp_path):

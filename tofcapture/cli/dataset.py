@@ -36,8 +36,7 @@ def _check(args: argparse.Namespace) -> Outcome:
         problems = check(path, tell)
     rows = [{"path": str(p.path), "where": p.where, "message": p.message, "hint": p.hint} for p in problems]
     lines = [line for p in problems for line in (str(p), f"  try: {p.hint}" if p.hint else "") if line]
-    verdict = f"{len(problems)} problems" if problems else "ok"
-    lines.append(f"{path}: {len(counted)} files, {verdict}")
+    lines.append(f"{path}: {len(counted)} files, {f'{len(problems)} problems' if problems else 'ok'}")
     data = {"path": str(path), "ok": not problems, "files": len(counted), "problems": rows}
     return Outcome(data, "\n".join(lines), exit_code=5 if problems else 0)
 
@@ -97,7 +96,7 @@ def _export(args: argparse.Namespace) -> Outcome:
             unit=args.unit,
             progress=lambda scene, done, total: report("export", done, total, scene),
         )
-    seconds = time.monotonic() - start
+    seconds = round(time.monotonic() - start, 2)
     data = {
         "out": str(args.out),
         "format": args.kind,
@@ -105,7 +104,7 @@ def _export(args: argparse.Namespace) -> Outcome:
         "written": list(result.written),
         "files": result.files,
         "bytes": result.size,
-        "seconds": round(seconds, 2),
+        "seconds": seconds,
     }
     text = (
         f"{args.out}: {result.files} files of {len(result.scenes)} scenes, {result.size / 1e6:.2f} MB; "

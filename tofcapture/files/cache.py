@@ -48,21 +48,10 @@ Progress = Callable[[str, int, int], None]
 
 
 class PackedScene:
-    """Reads one scene of a cache; maps its file on first use, pickles as its path.
+    """Reads one scene of a cache, as the index describes it; maps its file on first use, pickles as its path.
 
-    Parameters
-    ----------
-    folder
-        Of the cache.
-    scene
-        Name.
-    entry
-        What the index says of the scene.
-
-    Raises
-    ------
-    DataError
-        On first use, when the file is missing or not the one that was packed: it is hashed once per process.
+    On first use it raises :class:`DataError` for a file that is missing or not the one that was packed: it is hashed once per
+    process.
     """
 
     def __init__(self, folder: Path, scene: str, entry: Mapping[str, Any]) -> None:
@@ -252,19 +241,8 @@ def is_cache(folder: Path) -> bool:
 def open_cache(cache: Path, dataset: Path | None = None) -> dict[str, PackedScene]:
     """Open the scenes of a cache, by name, sorted.
 
-    Parameters
-    ----------
-    cache
-        Folder that :func:`pack` filled.
-    dataset
-        What it was packed from: with it, a cache that no longer agrees with the manifest is refused.
-
-    Raises
-    ------
-    DataError
-        The index is missing or damaged, or the cache is stale or incomplete.
-    FormatError
-        It is no cache, or of another version.
+    :class:`DataError` when the index is missing or damaged or, told the dataset that it was packed from, when the cache no longer
+    agrees with the manifest; :class:`FormatError` when it is no cache, or of another version.
     """
     cache = Path(cache)
     index = _load_index(cache)

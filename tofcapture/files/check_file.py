@@ -36,19 +36,7 @@ Finding = tuple[str, str]
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong.
-
-    Attributes
-    ----------
-    path
-        File or folder.
-    where
-        Dataset, attribute or entry; empty for the whole.
-    message
-        Expected and found.
-    hint
-        What to do; may be empty.
-    """
+    """One thing that is wrong: where in which file or folder (empty: all of it), expected and found, what to do."""
 
     path: Path
     where: str
@@ -73,15 +61,7 @@ def guarded(path: Path, problems: Callable[[], Iterator[Problem]]) -> list[Probl
 
 
 def check_file(path: Path, sha256: str | None = None) -> list[Problem]:
-    """List every problem of one view file or shard.
-
-    Parameters
-    ----------
-    path
-        The file.
-    sha256
-        Digest that the manifest or the journal promises.
-    """
+    """List every problem of one view file or shard; ``sha256`` is what the manifest or the journal promises."""
     return guarded(path, lambda: _check_file(path, sha256))
 
 

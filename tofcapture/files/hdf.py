@@ -26,13 +26,7 @@ _FILTERS = {
 
 
 def create(file: h5py.File, field: Field, shape: tuple[int, ...], dtype: np.dtype[Any]) -> h5py.Dataset:
-    """Create a field's dataset; the same calls give the same bytes (no time stamps).
-
-    Raises
-    ------
-    FormatError
-        The field does not allow this dtype.
-    """
+    """Create a field's dataset, of a dtype that it allows; the same calls give the same bytes (no time stamps)."""
     if dtype.name not in field.dtypes:
         raise FormatError(f"/{field.path}: expected {' or '.join(field.dtypes)}, got {dtype.name}")
     chunks = field.chunks(shape)
@@ -51,14 +45,9 @@ def write_attrs(file: h5py.File, layout: Layout, values: Mapping[str, Any]) -> N
 
 
 def open_checked(path: Path, layout: Layout) -> h5py.File:
-    """Open a file for reading and make sure that it is of the layout.
+    """Open a file of a layout for reading.
 
-    Raises
-    ------
-    DataError
-        Missing, truncated, or not HDF5.
-    FormatError
-        HDF5 of another format or version.
+    :class:`DataError` when it is missing, truncated or not HDF5; :class:`FormatError` when it is of another format or version.
     """
     try:
         # Chunks are single frames, read whole: HDF5 2 would keep 8 MB of each field of each open file for nothing.
@@ -110,24 +99,30 @@ def json_attr(file: h5py.File, name: str, path: Path) -> Any:
         raise FormatError(f"{path}: attribute {name!r} is not JSON: {err}") from err
 
 
-def fetch(file: h5py.File, field: Field, path: Path, part: Any = ()) -> Array:
-    """Read a dataset, whole or a part of it.
-
-    Raises
-    ------
-    FormatError
-        It is missing or of another dtype.
-    DataError
-        Its bytes are damaged (Fletcher-32).
-    """
-    dataset = file.get(field.path)
+def find(file: h5py.File, field: Field, path: Path) -> h5py.Dataset:
+    """Find a field's dataset; :class:`FormatError` when it is missing or of another dtype."""
+    try:
+        dataset = file.get(field.path)
+    except DAMAGES as err:
+        hint = f"tofcapture check {path}"
+        raise DataError(f"{path}: /{field.path} cannot be opened: {err}", hint) from err
     if not isinstance(dataset, h5py.Dataset):
         raise FormatError(f"{path}: expected the dataset /{field.path}, found none")
     if dataset.dtype.name not in field.dtypes:
-        raise FormatError(
-            f"{path}: /{field.path}: expected {' or '.join(field.dtypes)}, got {dataset.dtype.name}"
-        )
+        right = " or ".join(field.dtypes)
+        raise FormatError(f"{path}: /{field.path}: expected {right}, got {dataset.dtype.name}")
+    return dataset
+
+
+def read(dataset: h5py.Dataset, path: Path, part: Any = ()) -> Array:
+    """Read a dataset, whole or a part of it; :class:`DataError` when its bytes are damaged (Fletcher-32)."""
     try:
         return np.asarray(dataset[part])
     except DAMAGES as err:
-        raise DataError(f"{path}: /{field.path} is damaged: {err}", hint=f"tofcapture check {path}") from err
+        where = f"{dataset.name}{list(part) if part else ''}"
+        raise DataError(f"{path}: {where} is damaged: {err}", hint=f"tofcapture check {path}") from err
+
+
+def fetch(file: h5py.File, field: Field, path: Path, part: Any = ()) -> Array:
+    """Read a field, whole or a part of it, with the errors of :func:`find` and :func:`read`."""
+    return read(find(file, field, path), path, part)

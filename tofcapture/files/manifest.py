@@ -37,25 +37,10 @@ def _pretty(table: Mapping[str, Any]) -> str:
 
 
 def load_signed(path: Path, what: str, kind: tuple[str, int], hint: str) -> dict[str, Any]:
-    """Read a file of :func:`signed_text`, without its digest.
+    """Read a file of :func:`signed_text`, without its digest, of a kind (``format``, ``version``).
 
-    Parameters
-    ----------
-    path
-        The file.
-    what
-        Its name in messages.
-    kind
-        Expected ``format`` and ``version``.
-    hint
-        What to do about a damaged one.
-
-    Raises
-    ------
-    DataError
-        It cannot be read, is not JSON, or any byte of it was changed.
-    FormatError
-        It is of another format or version.
+    :class:`DataError` when it cannot be read, is not JSON, or any byte of it was changed; :class:`FormatError` when it is of
+    another kind. Messages call it ``what``.
     """
     try:
         data = path.read_bytes()
@@ -83,19 +68,7 @@ def object_of(scene: str) -> str:
 
 @dataclass(frozen=True)
 class SceneEntry:
-    """One scene of a dataset.
-
-    Attributes
-    ----------
-    path
-        Of the shard, relative to the dataset folder.
-    sha256
-        Of the shard's bytes.
-    views
-        Number of views in it.
-    split
-        ``train``, ``val`` or ``test``.
-    """
+    """One scene of a dataset: its shard (relative to the dataset's folder), that one's SHA-256 and views, its split."""
 
     path: str
     sha256: str
@@ -146,12 +119,8 @@ def write_manifest(dataset: Path, manifest: Manifest) -> Path:
 def load_manifest(dataset: Path) -> Manifest:
     """Read ``DATASET/manifest.json``.
 
-    Raises
-    ------
-    DataError
-        It is missing, not JSON, or changed after it was written.
-    FormatError
-        It is of another format or version, or an entry is incomplete.
+    :class:`DataError` when it is missing, not JSON, or changed after it was written; :class:`FormatError` when it is of another
+    version, or an entry is incomplete.
     """
     path = manifest_path(dataset)
     if not path.is_file():

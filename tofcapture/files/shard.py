@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.errors import DataError, FormatError
-from tofcapture.files.hdf import DAMAGES, Array, create, json_attr, open_checked, text_attr, write_attrs
+from tofcapture.errors import ConfigError, DataError, FormatError
+from tofcapture.files.hdf import Array, create, find, json_attr, open_checked, read, text_attr, write_attrs
 from tofcapture.files.info import stereo_from, stereo_table, tof_from, tof_table
 from tofcapture.files.layout import SHARD
 from tofcapture.files.seal import partial_path, remember, remembered, seal, verify
@@ -148,10 +148,8 @@ class ShardReader:
         Its digest in the manifest; ``None``: the one beside it counts, if there is one. On first use the whole file is hashed,
         once per process and for the processes that it hands readers to (docs/decisions/0016).
 
-    Raises
-    ------
-    DataError, FormatError
-        On first use, when the file is missing, damaged, foreign or of another version.
+    On first use it raises :class:`DataError` or :class:`FormatError` for a file that is missing, damaged, foreign or of another
+    version.
     """
 
     def __init__(self, path: Path | str, sha256: str | None = None) -> None:
@@ -197,28 +195,14 @@ class ShardReader:
     def _dataset(self, name: str) -> h5py.Dataset:
         file = self._open()
         if name not in self._datasets:
-            try:
-                found = file.get(name)
-            except DAMAGES as err:
-                raise DataError(
-                    f"{self.path}: /{name} cannot be opened: {err}", f"tofcapture check {self.path}"
-                ) from err
-            if not isinstance(found, h5py.Dataset):
-                raise FormatError(f"{self.path}: expected the dataset /{name}, found none")
-            self._datasets[name] = found
+            self._datasets[name] = find(file, SHARD[name], self.path)
         return self._datasets[name]
 
     def _row(self, name: str, *index: int) -> Array:
         dataset = self._dataset(name)
         if not all(0 <= i < n for i, n in zip(index, dataset.shape, strict=False)):
             raise DataError(f"{self.path}: /{name} has shape {dataset.shape}, asked for {index}")
-        try:
-            return np.asarray(dataset[index])
-        except DAMAGES as err:
-            where = f"/{name}{list(index)}"
-            raise DataError(
-                f"{self.path}: {where} is damaged: {err}", hint=f"tofcapture check {self.path}"
-            ) from err
+        return read(dataset, self.path, index)
 
     @cached_property
     def scene(self) -> str:
@@ -238,7 +222,10 @@ class ShardReader:
     @cached_property
     def rig(self) -> Rig:
         """The rig that the ground truth was projected with."""
-        return loads_rig(text_attr(self._open(), "rig", self.path), f"{self.path}: rig")
+        try:
+            return loads_rig(text_attr(self._open(), "rig", self.path), f"{self.path}: rig")
+        except ConfigError as err:  # this rig is no configuration of somebody's: the file is damaged
+            raise FormatError(err.message, hint=f"tofcapture check {self.path}") from err
 
     @cached_property
     def provenance(self) -> dict[str, Any]:
@@ -282,13 +269,7 @@ class ShardReader:
         return (1, 2, 4) if "gt/depth_4x" in self._open() else (1, 2)
 
     def ground_truth(self, view: int, scale: Scale) -> GroundTruth:
-        """Depth, normals and mask at 1x, 2x or, where it was built, 4x of the ToF image.
-
-        Raises
-        ------
-        DataError
-            When the shard has none at that scale.
-        """
+        """Depth, normals and mask at 1x, 2x or, where it was built, 4x of the ToF image; else :class:`DataError`."""
         if scale not in (1, 2) and scale not in self.scales:
             raise DataError(
                 f"{self.path}: expected ground truth at {scale}x, it is there at {scales_text(self.scales)}",
@@ -406,13 +387,7 @@ class ShardWriter:
                 raise FormatError(f"sample: expected /{field.path}, got none")
 
     def add(self, sample: Sample) -> None:
-        """Append one sample.
-
-        Raises
-        ------
-        FormatError
-            A row is missing, or its shape or dtype is not the shard's.
-        """
+        """Append one sample; :class:`FormatError` when a row is missing or has another shape or dtype than the shard's."""
         if self._file is None or self._added >= self._views:
             raise FormatError(f"{self._path}: expected {self._views} samples in an open writer, got one more")
         rows = _rows(sample)
@@ -435,18 +410,9 @@ class ShardWriter:
         self._added += 1
 
     def seal(self, provenance: Mapping[str, Any]) -> str:
-        """Write the attributes, verify every row, make the shard permanent.
+        """Write the attributes, verify every row, make the shard permanent; its SHA-256, hexadecimal.
 
-        Returns
-        -------
-        SHA-256 of the file, hexadecimal.
-
-        Raises
-        ------
-        FormatError
-            Fewer samples were added than promised.
-        DataError
-            What was read back is not what was written.
+        :class:`FormatError` when samples are missing, :class:`DataError` when what is read back is not what was written.
         """
         if self._file is None or self._added != self._views:
             raise FormatError(f"{self._path}: expected {self._views} samples, got {self._added}")

@@ -31,13 +31,7 @@ _TRUTH = ("depth", "normals", "target", "T_tof_stereo", "T_flange_tof")
 
 
 def check_scene_name(scene: str) -> str:
-    """Return the name of a scene, or refuse one that is no safe file name.
-
-    Raises
-    ------
-    ConfigError
-        Anything but 1 to 64 letters, digits, ``_``, ``.`` and ``-``, the first one a letter or digit.
-    """
+    """Return the name of a scene; :class:`ConfigError` for one that is no safe file name."""
     if not _SCENE.fullmatch(scene):
         raise ConfigError(
             f"scene: expected 1 to 64 letters, digits, '_', '.' or '-', got {scene!r}",
