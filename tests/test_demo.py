@@ -7,9 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from tofcapture.cli import demo, doctor, main
-from tofcapture.cli import weights as bundled
-from tofcapture.cli.weights import bundled_path, describe_weights
+from tofcapture.cli import demo, doctor, main, setup
+from tofcapture.cli.setup import bundled_path, describe_weights
 from tofcapture.errors import FormatError
 
 ANSWERS = {
@@ -119,7 +118,7 @@ def test_weights_are_described_without_the_libraries_that_run_them(tmp_path):
 def test_the_doctor_says_what_is_bundled(tmp_path, monkeypatch):
     """There, missing, or damaged; none of it is a failure, for only prediction needs it."""
     package = SimpleNamespace(submodule_search_locations=[str(tmp_path)])
-    monkeypatch.setattr(bundled, "find_spec", lambda _: package)
+    monkeypatch.setattr(setup, "find_spec", lambda _: package)
     assert bundled_path() is None
     (finding,) = doctor.check_weights()
     assert (finding.verdict, bool(finding.advice)) == ("WARN", True)
@@ -129,6 +128,6 @@ def test_the_doctor_says_what_is_bundled(tmp_path, monkeypatch):
     assert finding.verdict == "PASS"
     assert "compact" in finding.found
     checkpoint(path, cut=1)
-    assert doctor.check_weights()[0].verdict == "WARN"
-    monkeypatch.setattr(bundled, "find_spec", lambda _: None)
+    assert next(doctor.check_weights()).verdict == "WARN"
+    monkeypatch.setattr(setup, "find_spec", lambda _: None)
     assert bundled_path() is None

@@ -135,7 +135,7 @@ def test_extras_are_documented_and_complete():
     assert reached | set(re.findall(r"`(\w+)` \(not in `all`\)", page)) == set(extras)
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh", "fish"])
 def test_completion_knows_every_command(shell, capsys):
     """The generated scripts name all commands and their options."""
     assert main(["completion", shell]) == 0
@@ -154,7 +154,7 @@ def test_bash_completes(capsys, tmp_path):
         ("tofcapture view --p", "--png"),
         ("tofcapture calibrate ha", "hand-eye"),
     ):
-        line = f'source c; COMP_WORDS=({words}); COMP_CWORD={len(words.split()) - 1}; _tofcapture; echo "${{COMPREPLY[@]}}"'
+        line = f'source c; COMP_WORDS=({words}); COMP_CWORD={len(words.split()) - 1}; _shtab_tofcapture; echo "${{COMPREPLY[@]}}"'
         done = subprocess.run(["bash", "-c", line], cwd=tmp_path, capture_output=True, text=True, check=True)
         assert expected in done.stdout.split(), words
 

@@ -17,7 +17,7 @@ from torch.utils._pytree import tree_leaves
 
 from tofcapture.camera import Camera
 from tofcapture.cli import main
-from tofcapture.cli.weights import bundled_path
+from tofcapture.cli.setup import bundled_path
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
 from tofcapture.ops.phase import taps

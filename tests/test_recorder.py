@@ -9,7 +9,6 @@ import pytest
 
 from tofcapture.camera import Camera
 from tofcapture.cli import main
-from tofcapture.cli import record as record_command
 from tofcapture.devices.kinematics import HOME, MODELS, forward
 from tofcapture.devices.station import Station, read_station
 from tofcapture.errors import BusyError, ConfigError, DataError, DeviceError, MotionRefused
@@ -387,17 +386,6 @@ def test_command_dry_run_and_refusals(tmp_path, capsys, monkeypatch):
     assert main(["record", "--scene", "mug", "--out", str(out)]) == 4
     assert "--allow-motion" in capsys.readouterr().err
     assert main(["record", "--out", str(out)]) == 2
-
-
-def test_progress_without_a_terminal(capsys):
-    """Without a terminal progress is a few plain lines on stderr, with the time left."""
-    with record_command.progress_line("record mug") as show:
-        for i in range(101):
-            show(i, 100)
-    lines = capsys.readouterr().err.splitlines()
-    assert 10 <= len(lines) <= 12
-    assert "ETA" in lines[3]
-    assert lines[-1] == "record mug: 100/100"
 
 
 def test_check_knows_the_journal(tmp_path):

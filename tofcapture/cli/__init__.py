@@ -20,29 +20,14 @@ from tofcapture.errors import ConfigError, TofError, UsageError
 GROUP = "tofcapture.commands"
 EXIT_CODES = "exit codes: 0 ok, 1 unexpected, 2 usage, 3 config, 4 device, 5 data, 6 quality gate, 7 busy, 130 interrupted"
 DESCRIPTION = "Capture paired ToF raw data and stereo ground truth on a robot arm, build datasets, train networks on them."
+# fmt: off
 ORDER = (
-    "demo",
-    "doctor",
-    "record",
-    "daemon",
-    "status",
-    "stop",
-    "simulate",
-    "simulate-dataset",
-    "align",
-    "calibrate",
-    "build-dataset",
-    "check",
-    "stats",
-    "view",
-    "figure",
-    "pack",
-    "export-dataset",
-    "train",
-    "evaluate",
-    "predict",
-    "report",
+    "demo", "doctor", "record", "daemon", "status", "stop", "simulate", "simulate-dataset", "align", "calibrate",
+    "build-dataset", "check", "stats", "view", "figure", "pack", "export-dataset",
+    "train", "evaluate", "predict", "export", "report", "config", "completion",
 )
+# fmt: on
+"""Commands in the order in which they are listed; those of other packages come last."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -56,9 +41,8 @@ def _found() -> dict[str, EntryPoint]:
     found = {e.name: e for e in entry_points(group=GROUP)}
     if not found:
         raise ConfigError("no commands are registered", hint="install the package: pip install '.[all]'")
-    return {
-        name: found[name] for name in sorted(found, key=lambda n: (ORDER.index(n) if n in ORDER else 99, n))
-    }
+    names = sorted(found, key=lambda name: (ORDER.index(name) if name in ORDER else len(ORDER), name))
+    return {name: found[name] for name in names}
 
 
 def _load(entry: EntryPoint) -> Command:
@@ -68,6 +52,11 @@ def _load(entry: EntryPoint) -> Command:
             f"{entry.value}: expected a tofcapture.command.Command, got {type(command).__name__}"
         )
     return command
+
+
+def all_commands() -> dict[str, Command]:
+    """Load every command, in the order of the help."""
+    return {name: _load(entry) for name, entry in _found().items()}
 
 
 def parser(commands: dict[str, Command], *, named: bool = True) -> argparse.ArgumentParser:
@@ -116,27 +105,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         outcome = _run(argv)
     except TofError as err:
-        return _failed(err.message, err.hint, err.exit_code, type(err).__name__, as_json=as_json)
+        return _failed(type(err).__name__, err.message, err.hint, err.exit_code, as_json=as_json)
     except KeyboardInterrupt:
-        return _failed(
-            "interrupted", "run the same command again to go on", 130, "Interrupted", as_json=as_json
-        )
-    except ModuleNotFoundError as err:
+        hint = "run the same command again to go on"
+        return _failed("Interrupted", "interrupted", hint, 130, as_json=as_json)
+    except (ModuleNotFoundError, OSError) as err:
         if os.environ.get("TOFCAPTURE_TRACEBACK"):
             raise
-        return _failed(
-            f"the library {err.name} is missing",
-            "pip install 'tofcapture[all]'",
-            3,
-            "Missing",
-            as_json=as_json,
-        )
-    except OSError as err:
-        if os.environ.get("TOFCAPTURE_TRACEBACK"):
-            raise
-        return _failed(
-            str(err), "set TOFCAPTURE_TRACEBACK=1 to see where", 1, type(err).__name__, as_json=as_json
-        )
+        if isinstance(err, ModuleNotFoundError):
+            hint = "pip install 'tofcapture[all]'"
+            return _failed("Missing", f"the library {err.name} is missing", hint, 3, as_json=as_json)
+        hint = "set TOFCAPTURE_TRACEBACK=1 to see where"
+        return _failed(type(err).__name__, str(err), hint, 1, as_json=as_json)
     _tell(json.dumps(outcome.data, allow_nan=False, default=str) if as_json else outcome.text)
     return outcome.exit_code
 
@@ -152,15 +132,12 @@ def _tell(text: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _failed(message: str, hint: str, code: int, kind: str, *, as_json: bool) -> int:
+def _failed(kind: str, message: str, hint: str, code: int, *, as_json: bool) -> int:
     if as_json:
-        print(
-            json.dumps(
-                {"ok": False, "error": {"kind": kind, "message": message, "hint": hint, "exit_code": code}}
-            )
-        )
-    else:
-        print(f"tofcapture: {message}", file=sys.stderr)
-        if hint:
-            print(f"  try: {hint}", file=sys.stderr)
+        error = {"kind": kind, "message": message, "hint": hint, "exit_code": code}
+        print(json.dumps({"ok": False, "error": error}))
+        return code
+    print(f"tofcapture: {message}", file=sys.stderr)
+    if hint:
+        print(f"  try: {hint}", file=sys.stderr)
     return code

@@ -1,4 +1,4 @@
-"""``tofcapture daemon``: the recorder behind a local API and a web page."""
+"""``tofcapture daemon``, ``status`` and ``stop``: the recorder behind a local API and a web page."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
-from tofcapture.cli.config import station_path
+from tofcapture.cli.setup import station_path
 from tofcapture.command import Command, Outcome
+from tofcapture.errors import ConfigError
 
 
-def _configure(parser: argparse.ArgumentParser) -> None:
+def _configure_daemon(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--root", type=Path, required=True, metavar="FOLDER", help="where recordings go")
     parser.add_argument(
         "--http",
@@ -30,18 +32,15 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--print-unit", action="store_true", help="print a systemd unit and end")
 
 
-def _run(args: argparse.Namespace) -> Outcome:
+def _run_daemon(args: argparse.Namespace) -> Outcome:
+    from tofcapture.devices.station import read_station
+    from tofcapture.record.daemon.server import serve, tcp_address, unit
     from tofcapture.record.daemon.settings import Settings, open_folder
 
     state = open_folder(args.state)
     if args.print_unit:
-        from tofcapture.record.daemon.server import unit
-
         text = unit(args.root, state.root)
         return Outcome(data={"ok": True, "unit": text}, text=text)
-    from tofcapture.devices.station import read_station
-    from tofcapture.record.daemon.server import serve, tcp_address
-
     http = tcp_address(args.http) if args.http else None
     named = station_path(args.station)[0]
     station = named.resolve() if named else None
@@ -60,9 +59,71 @@ def _announce(socket: Path, url: str | None) -> None:
         print(f"listening on {where}", file=sys.stderr, flush=True)
 
 
-COMMAND = Command(
+def _configure_status(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--state", type=Path, metavar="FOLDER", help="the daemon's folder")
+    parser.add_argument("--url", action="store_true", help="print the address of its page, token included")
+
+
+def _run_status(args: argparse.Namespace) -> Outcome:
+    from tofcapture.record.daemon.client import ask
+
+    found = ask("GET", "/v1/state", state=args.state)
+    if args.url:
+        page = ask("GET", "/v1/page", state=args.state)["url"]
+        if page is None:
+            raise ConfigError("the daemon does not listen on TCP", hint="start it with --http 127.0.0.1:8765")
+        return Outcome(data={"ok": True, "url": page}, text=page)
+    return Outcome(data={"ok": True, **found}, text="\n".join(_lines(found)))
+
+
+def _lines(found: dict[str, Any]) -> list[str]:
+    job, count, health = found["job"], found["progress"], found["health"]
+    lines = [f"{found['phase']}{': ' + found['reason'] if found['reason'] else ''}"]
+    if job:
+        left = f", {count['eta_s']:.0f} s left" if count["eta_s"] else ""
+        lines.append(
+            f"job {job['id']}: {job['scene']} into {job['recording']}: {job['state']}, "
+            f"{count['sealed']}/{count['total']} views, {count['failed']} failed{left}"
+        )
+        lines += [f"  {job['reason']}"] if job["reason"] else []
+    if found["asks"]:
+        lines.append(f"it waits for a person to place {found['asks']!r} and to confirm on the page")
+    waiting = found["queue"].get("queued", 0)
+    free = f", {health['disk_free_bytes'] / 1e9:.1f} GB free" if health["disk_free_bytes"] else ""
+    lines.append(f"{waiting} waiting, recorder {health['recorder']}{free}")
+    return lines
+
+
+def _configure_stop(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--state", type=Path, metavar="FOLDER", help="the daemon's folder")
+
+
+def _run_stop(args: argparse.Namespace) -> Outcome:
+    from tofcapture.record.daemon.client import ask
+
+    found = ask("POST", "/v1/stop", state=args.state)
+    job = found["job"]
+    running = job and job["state"] == "running"
+    what = f"job {job['id']} ({job['scene']}) is given up" if running else "nothing was running"
+    text = f"the daemon rests, {what}; sealed views stay. tofcapture status shows the rest."
+    return Outcome(data={"ok": True, **found}, text=text)
+
+
+DAEMON = Command(
     help="record scenes in the background, behind a local API and a web page",
     example="tofcapture daemon --root recordings --http 127.0.0.1:8765",
-    configure=_configure,
-    run=_run,
+    configure=_configure_daemon,
+    run=_run_daemon,
+)
+STATUS = Command(
+    help="what the daemon is doing",
+    example="tofcapture status",
+    configure=_configure_status,
+    run=_run_status,
+)
+STOP = Command(
+    help="stop the arm now and give the daemon's job up; sealed views stay",
+    example="tofcapture stop",
+    configure=_configure_stop,
+    run=_run_stop,
 )

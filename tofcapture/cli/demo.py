@@ -7,12 +7,14 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tofcapture.cli.weights import bundled_path
+from tofcapture.cli.kit import table
+from tofcapture.cli.setup import bundled_path
 from tofcapture.command import Command, Outcome
+from tofcapture.errors import TofError
 
 SCENES = ("random-8", "random-15", "bottle")
 BOARD_VIEWS = 12
@@ -44,26 +46,19 @@ class _Steps:
         self.seconds: dict[str, float] = {}
 
     def run(self, title: str, *words: object) -> dict[str, Any]:
-        from tofcapture.errors import TofError
-
         line = [str(w) for w in words]
         _say(f"\n[{time.perf_counter() - self.started:5.0f} s] {title}\n  $ tofcapture {' '.join(line)}")
         start = time.perf_counter()
-        done = subprocess.run(
-            [sys.executable, "-m", "tofcapture", *line, "--json"],
-            stdout=subprocess.PIPE,
-            text=True,
-            check=False,
-        )
+        command = [sys.executable, "-m", "tofcapture", *line, "--json"]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
         self.seconds[title] = round(time.perf_counter() - start, 1)
         try:
             answer: dict[str, Any] = json.loads(done.stdout)
         except json.JSONDecodeError:
-            answer = {
-                "error": {"message": f"no answer, exit code {done.returncode}", "hint": "see the lines above"}
-            }
+            message = f"no answer, exit code {done.returncode}"
+            answer = {"error": {"message": message, "hint": "see the lines above"}}
         if done.returncode != 0:
-            error = answer.get("error", {"message": json.dumps(answer)[:500], "hint": ""})
+            error = answer.get("error", {"message": json.dumps(answer)[:500]})
             failure = TofError(f"{title}: {error['message']}", hint=error.get("hint", ""))
             failure.exit_code = done.returncode
             raise failure
@@ -149,32 +144,33 @@ def _row(method: dict[str, Any]) -> dict[str, float]:
     }
 
 
-_COLUMNS = ("mae_mm", "rmse_mm", "median_mm", "normal_mean_deg")
+_COLUMNS = {
+    "mae_mm": "MAE mm",
+    "rmse_mm": "RMSE mm",
+    "median_mm": "median mm",
+    "normal_mean_deg": "normal deg",
+}
 _NAMES = {"bundled": "bundled network", "trained": "small network"}
 
 
 def _text(data: Mapping[str, Any], out: Path) -> str:
-    number: Callable[[float], str] = "{:9.2f}".format
     names = {"sensor": "ToF sensor", "model": _NAMES[data["network"]]}
-    rows = [f"  {'':<24}   MAE mm  RMSE mm median mm  normal deg"]
-    for scenes, table in data["scenes"].items():
-        rows.append(f"  {scenes}")
-        for key, name in names.items():
-            rows.append(f"    {name:<22}" + "".join(number(table[key][k]) for k in _COLUMNS))
-    return "\n".join(
-        [
-            "",
-            f"alignment: {data['align']['rotation_error_deg']:.3f} deg, {data['align']['translation_error_mm']:.2f} mm at 0.8 m off the true rig",
-            f"ground truth with the true rig: median {data['gt']['median_error_mm']:.2f} mm, 99 % within {data['gt']['p99_error_mm']:.2f} mm",
-            f"ground truth with the rig as aligned: median {data['gt_aligned']['median_error_mm']:.2f} mm",
-            "",
-            *rows,
-            "",
-            f"report: {data['report']}   ({data['seconds']['total'] / 60:.1f} minutes in all)",
-            f"points: {data['prediction']}/cloud.ply   depth, normals and pictures beside it",
-            *_next(data["network"], out),
-        ]
-    )
+    rows = [
+        [f"{scenes}: {name}", *(f"{methods[key][column]:.2f}" for column in _COLUMNS)]
+        for scenes, methods in data["scenes"].items()
+        for key, name in names.items()
+    ]
+    align, truth, built = data["align"], data["gt"], data["gt_aligned"]
+    return f"""
+alignment: {align["rotation_error_deg"]:.3f} deg, {align["translation_error_mm"]:.2f} mm at 0.8 m off the true rig
+ground truth with the true rig: median {truth["median_error_mm"]:.2f} mm, 99 % within {truth["p99_error_mm"]:.2f} mm
+ground truth with the rig as aligned: median {built["median_error_mm"]:.2f} mm
+
+{table(["", *_COLUMNS.values()], rows, "  ")}
+
+report: {data["report"]}   ({data["seconds"]["total"] / 60:.1f} minutes in all)
+points: {data["prediction"]}/cloud.ply   depth, normals and pictures beside it
+""" + "\n".join(_next(data["network"], out))
 
 
 def _next(network: str, out: Path) -> list[str]:

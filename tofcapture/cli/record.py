@@ -6,19 +6,19 @@ A running daemon that keeps the recording gets the work; otherwise the recorder 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tofcapture.cli.config import station_path
+from tofcapture.cli.kit import progress, table
+from tofcapture.cli.setup import station_path
 from tofcapture.command import Command, Outcome
-from tofcapture.errors import MotionRefused
+from tofcapture.record.observer import Observer
 
 if TYPE_CHECKING:
     from tofcapture.devices.station import Station
+    from tofcapture.frames import View
     from tofcapture.record.plan import Plan
     from tofcapture.record.recorder import RecordResult
 
@@ -78,66 +78,67 @@ def _run(args: argparse.Namespace) -> Outcome:
     from tofcapture.frames import CALIBRATION
     from tofcapture.record.plan import plan_scene
     from tofcapture.record.recorder import record
+    from tofcapture.record.resources import check_motion_allowed
 
     scene = CALIBRATION if args.calibration else args.scene
-    args.station = station_path(args.station)[0]
+    station_file = station_path(args.station)[0]
     views = args.views if args.views is not None else _BOARD_VIEWS if args.calibration else _SCENE_VIEWS
-    if (handed := _handed_over(args, scene, views)) is not None:
+    here = args.dry_run or args.foreground or station_file is not None or args.turns != 1
+    if not here and (handed := _handed_over(args, scene, views)):
         return handed
-    with open_station(args.station, args.seed, allow_motion=args.allow_motion) as station:
+    with open_station(station_file, args.seed, allow_motion=args.allow_motion) as station:
         if args.dry_run:
             return _planned(args, scene, station, plan_scene(station, scene, views, args.turns))
-        _check_motion(station, allowed=args.allow_motion)
-        with progress_line(f"record {scene}") as progress:
-            show = progress
-            if args.calibration:
-                show = _metered(progress, station, args.out, plan_scene(station, scene, views))
+        hint = "look at --dry-run, clear the workspace, then add --allow-motion"
+        check_motion_allowed(station, args.allow_motion, hint)
+        with progress() as report:
             result = record(
-                station, scene, args.out, views=views, frames=args.frames, progress=show, turns=args.turns
+                station,
+                scene,
+                args.out,
+                views,
+                args.frames,
+                lambda done, total: report(f"record {scene}", done, total),
+                _BoardMeter(station) if args.calibration else None,
+                args.turns,
             )
     return _recorded(args.out, result)
 
 
-def _metered(
-    progress: Callable[[int, int], None], station: Station, recording: Path, plan: Plan
-) -> Callable[[int, int], None]:
-    """Print what the board views cover after each one."""
-    from tofcapture.devices.clearance import stage_of
-    from tofcapture.frames import CALIBRATION
-    from tofcapture.record.board_meter import meter, taken
+class _BoardMeter(Observer):
+    """Prints what the board views cover after each one."""
 
-    stage, rig, said = stage_of(station.config), station.rig, [-1]
+    def __init__(self, station: Station) -> None:
+        self._station = station
+        self._there: list[int] = []
 
-    def show(done: int, total: int) -> None:
-        progress(done, total)
-        flanges = taken(plan, recording, CALIBRATION)
-        if len(flanges) not in {said[0], 0}:
-            said[0] = len(flanges)
-            poses = [T @ rig.T_flange_tof for T in flanges]
-            print(meter(poses, stage.board, stage.board_normal, rig.tof), file=sys.stderr, flush=True)
+    def planned(self, plan: Plan, kept: set[int], repaired: list[str]) -> None:
+        """Note where the views are taken from."""
+        del repaired
+        T_flange_tof = self._station.rig.T_flange_tof
+        self._poses = {view.index: view.T_base_flange @ T_flange_tof for view in plan.views}
+        self._there = sorted(kept)
 
-    return show
+    def sealed(self, view: View, sha256: str) -> None:
+        """Print the meter."""
+        from tofcapture.devices.clearance import stage_of
+        from tofcapture.record.board_meter import meter
 
-
-def _check_motion(station: Station, *, allowed: bool) -> None:
-    """Ask for consent before a real arm moves."""
-    if not (station.simulated or allowed):
-        raise MotionRefused(
-            f"the arm {station.arm.describe().model} is real and --allow-motion was not given",
-            hint="look at --dry-run, clear the workspace, then add --allow-motion",
-        )
+        del sha256
+        self._there.append(view.index)
+        stage, camera = stage_of(self._station.config), self._station.rig.tof
+        poses = [self._poses[i] for i in self._there]
+        print(meter(poses, stage.board, stage.board_normal, camera), file=sys.stderr, flush=True)
 
 
 def _handed_over(args: argparse.Namespace, scene: str, views: int) -> Outcome | None:
-    """Give the work to a daemon; ``None`` when there is none for it, or something was asked for that only works here."""
-    if args.dry_run or args.foreground or args.station is not None or args.turns != 1:
-        return None
+    """Give the work to the daemon that keeps this recording; ``None`` when there is none."""
     from tofcapture.record.daemon.client import hand_over
 
-    wish = {"scene": scene, "views": views, "frames": args.frames}
+    request = {"scene": scene, "views": views, "frames": args.frames}
     if args.seed is not None:
-        wish["seed"] = args.seed
-    job = hand_over(args.out, wish)
+        request["seed"] = args.seed
+    job = hand_over(args.out, request)
     if job is None:
         return None
     text = f"job {job['id']} of the daemon that keeps {args.out}: {job['state']}. tofcapture status shows how it goes."
@@ -157,22 +158,20 @@ def _planned(args: argparse.Namespace, scene: str, station: Station, plan: Plan)
     write_plan(plan, stage, station.rig, target, title, picture)
     return Outcome(
         data={"ok": True, "scene": scene, "plan": plan.as_json(), "picture": str(picture)},
-        text="\n".join([plan.summary(), *_plan_rows(plan), *plan.shortfall(), f"drawn in {picture}"]),
+        text="\n".join([plan.summary(), _plan_table(plan), *plan.shortfall(), f"drawn in {picture}"]),
     )
 
 
-def _plan_rows(plan: Plan) -> list[str]:
-    """One line for each view, in the order of travel."""
-    import math
-
-    rows = ["view   turn  distance   tilt   from    joints (deg)"]
+def _plan_table(plan: Plan) -> str:
+    """Lay out one line for each view, in the order of travel."""
+    rows = []
     for v in plan.views:
         x, y, z = (float(c) for c in v.direction)
         tilt, side = math.degrees(math.acos(min(1.0, z))), math.degrees(math.atan2(y, x))
         joints = " ".join(f"{math.degrees(q):+7.1f}" for q in v.joints)
-        turn = math.degrees(v.turn)
-        rows.append(f"{v.index:4d}  {turn:5.0f}  {v.distance:6.3f} m  {tilt:5.0f}  {side:+5.0f}   {joints}")
-    return rows
+        angles = f"{math.degrees(v.turn):.0f}", f"{v.distance:.3f} m", f"{tilt:.0f}", f"{side:+.0f}"
+        rows.append([v.index, *angles, joints])
+    return table(["view", "turn", "distance", "tilt", "from", "joints (deg)"], rows)
 
 
 def _recorded(recording: Path, result: RecordResult) -> Outcome:
@@ -198,66 +197,6 @@ def _recorded(recording: Path, result: RecordResult) -> Outcome:
         "plan": {"digest": result.plan.digest, "views": len(result.plan.views), "wanted": result.plan.wanted},
     }
     return Outcome(data=data, text="\n".join(lines), exit_code=4 if result.failed else 0)
-
-
-@contextmanager
-def progress_line(title: str) -> Iterator[Callable[[int, int], None]]:
-    """Show progress on stderr: a bar with ETA on a terminal, otherwise a line for every tenth of the way.
-
-    Yields
-    ------
-    function of (done, total)
-    """
-    if sys.stderr.isatty():
-        yield from _bar(title)
-    else:
-        yield _lines(title)
-
-
-def _bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("ETA"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(title, total=None)
-
-        def show(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
-        yield show
-
-
-def _lines(title: str) -> Callable[[int, int], None]:
-    start = time.monotonic()
-    first: list[int] = []
-    said = [-1]
-
-    def show(done: int, total: int) -> None:
-        first[:] = first or [done]
-        tenth = 10 * done // max(total, 1)
-        if tenth == said[0]:
-            return
-        said[0] = tenth
-        gone = time.monotonic() - start
-        eta = f", ETA {gone / (done - first[0]) * (total - done):.0f} s" if first[0] < done < total else ""
-        print(f"{title}: {done}/{total}{eta}", file=sys.stderr, flush=True)
-
-    return show
 
 
 COMMAND = Command(

@@ -6,13 +6,11 @@ Nothing is detected: the meter says where the board should have been seen. ``tof
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from tofcapture.camera import Camera
 from tofcapture.poses import Float64, invert, look_at, transform_points
-from tofcapture.record.plan import Plan
 
 SECTORS = ("right", "lower right", "below", "lower left", "left", "upper left", "above", "upper right")
 TILTS = (0.0, 8.0, 15.0, 25.0, 40.0, 90.0)  # deg
@@ -79,10 +77,3 @@ def _seen(T_base_tof: Float64, board: Float64, normal: Float64, camera: Camera) 
         reach = -eye[2] / way[..., 2]
         met = transform_points(T_board_tof, rays * reach[..., None])
     return np.asarray((reach > 0) & (np.hypot(met[..., 0], met[..., 1]) < RADIUS))
-
-
-def taken(plan: Plan, recording: Path, scene: str) -> list[Float64]:
-    """``T_base_flange`` (4, 4) of the planned views whose files are there."""
-    from tofcapture.files.view import view_path
-
-    return [v.T_base_flange for v in plan.views if view_path(recording, scene, v.index).exists()]

@@ -1,4 +1,4 @@
-"""What a recorder needs for itself: room on the disk, its recording, its arm."""
+"""What a recorder needs before it starts: room on the disk, its recording, its arm, leave to move it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tofcapture.errors import BusyError, ConfigError
+from tofcapture.errors import BusyError, ConfigError, MotionRefused
 
 if TYPE_CHECKING:
     from tofcapture.devices import Arm
+    from tofcapture.devices.station import Station
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 _VIEW_BYTES = 40e6  # a view of a full-size rig with truth, and room to spare
@@ -132,3 +133,16 @@ def hold_arm(arm: Arm) -> Iterator[None]:
                 f"the arm {info.model} {info.serial} is moved by another process", hint="tofcapture status"
             ) from err
         yield
+
+
+def check_motion_allowed(station: Station, allowed: bool, hint: str) -> None:
+    """Refuse to begin with a real arm that nobody allowed to move.
+
+    Raises
+    ------
+    MotionRefused
+        The arm is real, and ``--allow-motion`` was not given; ``hint`` says what to do.
+    """
+    if not (station.simulated or allowed):
+        model = station.arm.describe().model
+        raise MotionRefused(f"the arm {model} is real and --allow-motion was not given", hint=hint)

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from tofcapture.devices import Operator
-from tofcapture.errors import BusyError, DeviceError, MotionRefused, TofError
+from tofcapture.errors import BusyError, DeviceError, TofError
 from tofcapture.record.observer import Observer, Stopped
-from tofcapture.record.resources import DiskFull
+from tofcapture.record.resources import DiskFull, check_motion_allowed
 
 if TYPE_CHECKING:
     from tofcapture.devices.station import Station
@@ -176,11 +176,8 @@ def _work(job: Mapping[str, Any], link: Link) -> dict[str, Any]:
     path = Path(job["station"]) if job["station"] else None
     with open_station(path, job["seed"], allow_motion=job["allow_motion"]) as station:
         link.station = station
-        if not (station.simulated or job["allow_motion"]):
-            raise MotionRefused(
-                f"the arm {station.arm.describe().model} is real and the daemon was started without --allow-motion",
-                hint="look at record --dry-run, clear the workspace, then start the daemon with --allow-motion",
-            )
+        hint = "look at record --dry-run, clear the workspace, then start the daemon with --allow-motion"
+        check_motion_allowed(station, job["allow_motion"], hint)
         link.tell("opened", station=station.describe(), simulated=station.simulated)
         staffed = replace(station, operator=PageOperator(link)) if station.operator.person else station
         reporter = Reporter(link, Path(job["previews"]))
