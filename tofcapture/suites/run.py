@@ -43,16 +43,14 @@ def simulate_dataset(
     progress: Progress | None = None,
     split: str | None = None,
 ) -> Simulated:
-    """Simulate and build a dataset, or complete one.
+    """Simulate and build a dataset in the folder ``out``, or complete one.
 
     Parameters
     ----------
-    spec, out
-        What is wanted, and the dataset's folder.
+    spec, out, progress
+        What is wanted; where; told about once a second.
     jobs
         Processes; by default one per core. ``1`` works in this process.
-    progress
-        Told about once a second.
     split
         Of all scenes, for a dataset that is only trained on or only evaluated on; ``None``: by their objects.
 
@@ -60,8 +58,6 @@ def simulate_dataset(
     ------
     ConfigError
         Nothing is wanted, the folder holds something else, or the disk is too small.
-    TofError
-        A worker process died too often.
     """
     start = time.monotonic()
     _check(spec, out)
@@ -80,7 +76,7 @@ def simulate_dataset(
 
 
 def _there(spec: DatasetSpec, out: Path) -> dict[int, Made]:
-    """Scenes that need not be made again; a folder with scenes of another spec is refused."""
+    """Find scenes that need not be made again; a folder with scenes of another spec is refused."""
     names = [spec.scene(i).name for i in range(spec.scenes)]
     others = {p.stem for p in (out / "simulation").glob("*.json")} - set(names)
     if others:

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from tofcapture.devices.registry import check_keys
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 from tofcapture.poses import Float64, transform
 
@@ -45,12 +46,9 @@ class FaultPlan:
 def read_faults(table: Mapping[str, Any]) -> FaultPlan:
     """Read ``[sim.faults]``; :class:`ConfigError` on unknown keys, and anything but lists of burst numbers or numbers."""
     known = {f.name: f.default for f in fields(FaultPlan)}
+    check_keys(table, known, "[sim.faults]")
     values: dict[str, Any] = {}
     for key, value in table.items():
-        if key not in known:
-            raise ConfigError(
-                f"[sim.faults] does not know {key}", hint=f"it knows {', '.join(sorted(known))}"
-            )
         if isinstance(known[key], tuple):
             good, expected = (
                 isinstance(value, list) and all(type(k) is int and k >= 0 for k in value),

@@ -46,46 +46,28 @@ def factory_calibration(constants: Constants, seed: int) -> tuple[RangeError, ..
     for e in constants.sensor.range_errors:
         h = 1 + wrong["harmonics_error"] * rng.standard_normal((len(e.harmonics), 2))
         slope = 1 + wrong["slope_error"] * rng.standard_normal(2)
-        out.append(
-            replace(
-                e,
-                offset=e.offset + wrong["offset_error"] * float(rng.standard_normal()),
-                harmonics=tuple(
-                    (m, a * float(x), b * float(y)) for (m, a, b), (x, y) in zip(e.harmonics, h, strict=True)
-                ),
-                per_pixel_radius=e.per_pixel_radius * float(slope[0]),
-                per_kelvin=e.per_kelvin * float(slope[1]),
-            )
+        offset = e.offset + wrong["offset_error"] * float(rng.standard_normal())
+        harmonics = tuple(
+            (m, a * float(x), b * float(y)) for (m, a, b), (x, y) in zip(e.harmonics, h, strict=True)
         )
+        radius, kelvin = e.per_pixel_radius * float(slope[0]), e.per_kelvin * float(slope[1])
+        out.append(replace(e, offset=offset, harmonics=harmonics, per_pixel_radius=radius, per_kelvin=kelvin))
     return tuple(out)
 
 
 class SimWorld:
     """A scene, a pose, and what the devices of one station measure there.
 
-    Parameters
-    ----------
-    constants
-        The devices.
-    seed
-        Seeds everything random, the makers' calibrations and the bracket's drawing error included.
-    scenes
-        ``(name, seed) -> objects`` in the base frame.
-    faults
-        What goes wrong on demand.
+    ``constants`` describe the devices, ``scenes`` are ``(name, seed) -> objects`` in the base frame, ``faults`` go wrong on
+    demand. ``seed`` seeds everything random, the makers' calibrations and the bracket's drawing error included.
     """
 
     def __init__(
-        self,
-        constants: Constants,
-        seed: int,
-        scenes: Callable[[str, int], Sequence[SceneObject]],
+        self, constants: Constants, seed: int, scenes: Callable[[str, int], Sequence[SceneObject]],
         faults: FaultPlan | None = None,
-    ) -> None:
-        self.constants = constants
-        self.seed = seed
-        self._scenes = scenes
-        self._scene = ""
+    ) -> None:  # fmt: skip
+        self.constants, self.seed = constants, seed
+        self._scenes, self._scene = scenes, ""
         self._pose: tuple[Float64, bytes] | None = None
         self._built: tuple[str, Caster, Transport | None] | None = None
         self._lit: tuple[object, Light] | None = None
@@ -108,14 +90,10 @@ class SimWorld:
     def true_rig(self) -> Rig:
         """Say where the cameras truly are, with the true range errors."""
         rig = self.constants.rig
-        return Rig(
-            tof=self.constants.tof,
-            stereo=self.constants.stereo,
-            illuminator=self.constants.illuminator,
-            T_tof_stereo=transform(rotation_exp(rig["stereo_rotation"]), rig["stereo_position"]),
-            T_flange_tof=transform(rotation_exp(rig["tof_rotation"]), rig["tof_position"]),
-            range_errors=self.constants.sensor.range_errors,
-        )
+        T_tof_stereo = transform(rotation_exp(rig["stereo_rotation"]), rig["stereo_position"])
+        T_flange_tof = transform(rotation_exp(rig["tof_rotation"]), rig["tof_position"])
+        c = self.constants
+        return Rig(c.tof, c.stereo, T_tof_stereo, T_flange_tof, c.illuminator, c.sensor.range_errors)
 
     def nominal_rig(self) -> Rig:
         """Say what the bracket's drawing and the maker's calibration say: wrong by degrees and millimetres."""
@@ -137,21 +115,15 @@ class SimWorld:
         self._scene = scene
 
     def set_pose(self, T_base_flange: Float64, key: bytes) -> None:
-        """Tell the world where the flange truly is (4, 4).
-
-        ``key`` names the commanded pose; the noise of a view is drawn from seed, scene and key.
-        """
+        """Tell the world where the flange truly is (4, 4); noise is drawn from seed, scene and ``key`` of the commanded pose."""
         self._pose = (T_base_flange, key)
 
     def _here(self) -> tuple[Float64, bytes]:
         if self._pose is None:
-            raise DeviceError(
-                "the simulated arm has not been opened", hint="open the arm before the cameras capture"
-            )
+            hint = "open the arm before the cameras capture"
+            raise DeviceError("the simulated arm has not been opened", hint)
         if not self._scene:
-            raise DeviceError(
-                "no scene stands on the simulated table", hint="call operator.place(scene) first"
-            )
+            raise DeviceError("no scene stands on the simulated table", "call operator.place(scene) first")
         T_base_flange, key = self._pose
         return T_base_flange @ self.faults.offset, key
 
@@ -162,17 +134,10 @@ class SimWorld:
         """Return the present scene, ready for rays, and the light between its surfaces."""
         if self._built is None or self._built[0] != self._scene:
             caster = Caster(merge(self._scenes(self._scene, self.seed)))
-            render = self.constants.render
-            transport = None
-            if render.multipath:
-                transport = Transport(
-                    caster, frequencies(self.tof_info.modulation_hz), render.patches, render.patch_rays
-                )
+            render, hz = self.constants.render, frequencies(self.tof_info.modulation_hz)
+            transport = Transport(caster, hz, render.patches, render.patch_rays) if render.multipath else None
             self._built = (self._scene, caster, transport)
         return self._built[1], self._built[2]
-
-    def _pose_of(self, T_flange_camera: Float64) -> Float64:
-        return self._here()[0] @ T_flange_camera
 
     def light(self) -> Light:
         """Compute what reaches the ToF pixels at the present pose."""
@@ -180,50 +145,31 @@ class SimWorld:
         name = (self._scene, key, T_base_flange.tobytes())
         if self._lit is None or self._lit[0] != name:
             caster, transport = self.caster()
-            render = self.constants.render
-            T_base_tof = self._pose_of(self.true_rig.T_flange_tof)
-            lamp = Lamp(
-                transform_points(T_base_tof, self.constants.illuminator),
-                T_base_tof[:3, 2],
-                **self.constants.lamp,
-            )
-            light = light_at_pixels(
-                caster,
-                self.constants.tof,
-                T_base_tof,
-                lamp,
-                frequencies(self.tof_info.modulation_hz),
-                transport,
-                subpixels=render.subpixels,
-                rays=render.rays,
-            )
-            self._lit = (name, light)
+            c, hz = self.constants, frequencies(self.tof_info.modulation_hz)
+            T_base_tof = T_base_flange @ self.true_rig.T_flange_tof
+            lamp = Lamp(transform_points(T_base_tof, c.illuminator), T_base_tof[:3, 2], **c.lamp)
+            fineness = c.render.subpixels, c.render.rays
+            self._lit = (name, light_at_pixels(caster, c.tof, T_base_tof, lamp, hz, transport, *fineness))
         return self._lit[1]
 
     def tof(self, frames: int, clock: Callable[[], int]) -> TofBurst:
         """Take a ToF burst; ``clock`` gives int ns."""
         start = clock()
         light = self.light()
-        raw, celsius = expose(
-            light, self.constants.sensor, self.tof_info, frames, self._rng("tof"), self.seed
-        )
+        sensor, rng = self.constants.sensor, self._rng("tof")
+        raw, celsius = expose(light, sensor, self.tof_info, frames, rng, self.seed)
         times = start + (np.arange(frames) * 1e9 / 30).astype(np.int64)
         return TofBurst(raw=raw, time_ns=times, celsius=celsius, info=self.tof_info)
 
     def stereo(self, clock: Callable[[], int]) -> StereoFrame:
         """Take a stereo point map; ``clock`` gives int ns."""
-        points = point_map(
-            self.caster()[0],
-            self.constants.stereo,
-            self._pose_of(self.true_rig.T_flange_stereo),
-            self.constants.stereo_model,
-            self._rng("stereo"),
-        )
+        c, pose = self.constants, self._here()[0] @ self.true_rig.T_flange_stereo
+        points = point_map(self.caster()[0], c.stereo, pose, c.stereo_model, self._rng("stereo"))
         return StereoFrame(points=points, time_ns=clock(), info=self.stereo_info)
 
     def truth(self) -> Truth:
         """Say what is exactly true of the present view."""
-        T_base_tof = self._pose_of(self.true_rig.T_flange_tof)
+        T_base_tof = self._here()[0] @ self.true_rig.T_flange_tof
         depth, normals, target = exact_view(self.caster()[0], self.constants.tof.scaled(2), T_base_tof)
         return Truth(depth, normals, target, self.true_rig.T_tof_stereo, self.true_rig.T_flange_tof)
 
