@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calibration.alignment.averages import average_transforms
 from calibration.hand_eye.checks import check_motion, clean
 from calibration.hand_eye.closed_form import invert_all, park_martin, rotation_vectors
-from tofcapture.errors import DataError, QualityError
+from tofcapture.errors import QualityError
 from tofcapture.poses import Float64, exp, hat, invert, log
 
 CAMERAS = ("tof", "stereo")
@@ -91,26 +91,20 @@ def solve_bundle(
 ) -> Bundle:
     """Solve for both cameras and the board, or refuse by name.
 
-    Parameters
-    ----------
-    arm
-        (N, 4, 4) T_base_flange.
-    fits
-        Of both cameras, in any order; a view may lack either.
-    arm_sigma
-        Standard deviation of an arm pose per axis: metres, radians.
+    The fits are of both cameras, in any order; a view may lack either. ``arm`` is (N, 4, 4) T_base_flange, ``arm_sigma`` the standard
+    deviation of an arm pose per axis, metres and radians.
 
     Raises
     ------
     DataError
-        Impossible poses, covariances or cameras.
+        Impossible poses.
     QualityError
         Fewer than five fits of a camera.
     HandEyeRefused
         Motion that determines nothing: pure translation, small rotations, a single axis; named by its ``cause``.
     """
     A = clean(arm, "arm poses")
-    _check(A, fits)
+    _check(fits)
     motion, X, Z = _start(A, fits)
     seen = _Observations(
         A,
@@ -137,17 +131,7 @@ def solve_bundle(
     return Bundle(X[0], X[1], Z, covariance, variance, seen.weight(r), seen.arm_error(E), motion)
 
 
-def _check(A: Float64, fits: Sequence[BoardFit]) -> None:
-    for f in fits:
-        if f.camera not in CAMERAS or not 0 <= f.view < len(A):
-            raise DataError(
-                f"board fit: expected a camera of {CAMERAS} and a view below {len(A)}, got {f.camera!r}, {f.view}"
-            )
-        C = np.asarray(f.covariance)
-        if C.shape != (6, 6) or not np.isfinite(C).all() or np.linalg.eigvalsh((C + C.T) / 2)[0] <= 0:
-            raise DataError(
-                f"board fit of view {f.view}, {f.camera}: expected a positive definite (6, 6) covariance"
-            )
+def _check(fits: Sequence[BoardFit]) -> None:
     for camera in CAMERAS:
         count = sum(f.camera == camera for f in fits)
         if count < MIN_FITS:

@@ -12,9 +12,9 @@ import pytest
 from calibration.align import align
 from calibration.alignment.averages import average_transforms
 from calibration.alignment.methods import alignment_error
-from calibration.alignment.rounds import RangeResidual, Solution, fit_range_residual, no_residual
+from calibration.alignment.rounds import RangeResidual, Solution, fit_range_residual
 from calibration.cli.align import ALIGN
-from calibration.evidence.evidence import evidence_of
+from calibration.evidence import evidence_of
 from calibration.registration.clouds import (
     Cloud,
     grid_normals,
@@ -245,9 +245,7 @@ def test_numbers_of_evidence_are_those_of_the_registrations():
     lost = replace(registrations[4], inliers=0, rmse=np.nan, condition=np.inf, fitness=0.0)
     refusals = [None] * 4 + [Refusal.NO_OVERLAP]
     average = average_transforms([r.T_target_source for r in registrations[:4]], at)
-    residual = replace(
-        no_residual(TOF, 100e6), coefficients=np.array([0.004, 1e-5, 0, 0, 0.001, -0.002, 0, 0])
-    )
+    residual = RangeResidual(TOF, 100e6, np.array([0.004, 1e-5, 0, 0, 0.001, -0.002, 0, 0]))
     solution = Solution([*registrations[:4], lost], refusals, average, [0, 1, 2, 3], at, residual)
     rig = Rig(TOF, STEREO, np.eye(4), np.eye(4))
     none = Cloud(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -386,7 +384,7 @@ def test_range_residual_recovers_a_wave():
         source = exact + exact * longer[:, None]
         pairs.append(Pair("", "", source, target, Rig(TOF, STEREO, np.eye(4), np.eye(4)), 100e6, None))
         registrations.append(measure_registration(np.eye(4), source, target))
-    found = fit_range_residual(pairs, registrations, no_residual(TOF, 100e6))
+    found = fit_range_residual(pairs, registrations, RangeResidual(TOF, 100e6))
     np.testing.assert_allclose(found.coefficients[4:6], truth.coefficients[4:6], atol=2e-4)
 
 

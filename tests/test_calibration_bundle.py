@@ -11,7 +11,7 @@ from calibration.bundle import ARM_SIGMA, BoardFit, solve_bundle
 from calibration.cli.bundle import consistency
 from calibration.hand_eye.refusal import Cause, HandEyeRefused
 from tofcapture import poses
-from tofcapture.errors import DataError, QualityError
+from tofcapture.errors import QualityError
 
 X_TOF = poses.transform(poses.rotation_exp([0.1, -0.3, 1.2]), [0.05, 0.02, 0.09])
 X_STEREO = X_TOF @ poses.transform(poses.rotation_exp([0.045, 0.012, 0.009]), [-0.05, 0.075, 0.004])
@@ -130,16 +130,9 @@ def test_degenerate_motion_is_refused_by_name(motion, cause):
     assert caught.value.cause is cause
 
 
-def test_too_few_fits_and_bad_fits_are_refused():
-    """Four fits of a camera, a camera of another name, a view that is not there and no covariance are named."""
+def test_too_few_fits_are_refused():
+    """Four fits of a camera are named."""
     arm = arms(np.random.default_rng(7), 6)
     fits = fits_of(arm)
     with pytest.raises(QualityError, match="of the stereo camera, got 4"):
         solve_bundle(arm, [f for f in fits if f.camera == "tof" or f.view < 4])
-    for bad in (
-        replace(fits[0], camera="left"),
-        replace(fits[0], view=6),
-        replace(fits[0], covariance=np.zeros((6, 6))),
-    ):
-        with pytest.raises(DataError, match="expected"):
-            solve_bundle(arm, [bad, *fits[1:]])

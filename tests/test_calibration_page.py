@@ -13,8 +13,8 @@ import pytest
 from calibration.board.detector import BoardRefusal, detect, stereo_sight, tof_sight
 from calibration.board.geometry import load_board
 from calibration.cli.align import _page
+from calibration.evidence import judged_evidence, read_evidence
 from calibration.evidence.compare import OldRig, drift, drift_text, load_old, uncertainty
-from calibration.evidence.evidence import judged_evidence, read_evidence
 from calibration.evidence.page import charts, write_page
 from calibration.evidence.page.checks import image_medians
 from calibration.evidence.page.content import page_content

@@ -7,7 +7,7 @@ distances that tell outliers and the spread (0.1 degrees are 1.4 mm at 0.8 m).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,25 +88,32 @@ def median_rotation(rotations: ArrayLike) -> Float64:
     Weiszfeld's algorithm on SO(3) (Hartley, Aftab, Trumpf, CVPR 2011), started at the chordal mean.
     """
     R = np.asarray(rotations, dtype=np.float64)
-    centre = mean_rotation(R)
-    for _ in range(ITERATIONS):
-        step = _weiszfeld_step(np.stack([rotation_log(r @ centre.T) for r in R]))
-        centre = rotation_exp(step) @ centre
-        if np.linalg.norm(step) < STOP:
-            break
-    return centre
+    return _weiszfeld(
+        mean_rotation(R),
+        lambda centre: np.stack([rotation_log(r @ centre.T) for r in R]),
+        lambda centre, step: np.asarray(rotation_exp(step) @ centre),
+    )
 
 
 def median_point(points: ArrayLike) -> Float64:
     """Find the geometric median (3,) of points (N, 3), by Weiszfeld's algorithm from the component-wise median."""
     P = np.asarray(points, dtype=np.float64)
-    centre = np.median(P, axis=0)
+    return _weiszfeld(
+        np.median(P, axis=0), lambda centre: P - centre, lambda centre, step: np.asarray(centre + step)
+    )
+
+
+def _weiszfeld(
+    centre: Float64, offsets: Callable[[Float64], Float64], moved: Callable[[Float64, Float64], Float64]
+) -> Float64:
     for _ in range(ITERATIONS):
-        step = _weiszfeld_step(P - centre)
-        centre = centre + step
+        away = offsets(centre)
+        weights = 1 / np.maximum(np.linalg.norm(away, axis=1), 1e-12)
+        step = weights @ away / weights.sum()
+        centre = moved(centre, step)
         if np.linalg.norm(step) < STOP:
             break
-    return np.asarray(centre)
+    return centre
 
 
 def fuse(transforms: Sequence[Float64], informations: Sequence[Float64]) -> Float64:
@@ -115,18 +122,8 @@ def fuse(transforms: Sequence[Float64], informations: Sequence[Float64]) -> Floa
     Each registration counts in each direction as much as it knows there. A view that slides along its board has little
     information across it and does not drag the mean that way.
 
-    Parameters
-    ----------
-    transforms
-        N of (4, 4), N >= 1.
-    informations
-        N of (6, 6), symmetric, not negative, of the right twist of each: ``T_true = T_i exp(xi)``, xi = (rho, phi) with
-        covariance ``H_i^-1``. Each may be singular, their sum may not.
-
-    Raises
-    ------
-    DataError
-        A motion that none of them determines.
+    The informations (6, 6) are of the right twist of each: ``T_true = T_i exp(xi)``, xi = (rho, phi) with covariance ``H_i^-1``.
+    Each may be singular; :class:`DataError` where their sum leaves a motion undetermined.
     """
     T = np.asarray(transforms[int(np.argmax([np.trace(H) for H in informations]))], dtype=np.float64)
     for _ in range(ITERATIONS):
@@ -170,12 +167,6 @@ def _limit(distance: Float64, floor: float) -> float:
 
 def _deviation(distance: Float64) -> float:
     return float(np.sqrt(np.square(distance).sum() / max(len(distance) - 1, 1)))
-
-
-def _weiszfeld_step(offsets: Float64) -> Float64:
-    weights = 1 / np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
-    out: Float64 = weights @ offsets / weights.sum()
-    return out
 
 
 def _right_jacobian_inverse(e: Float64) -> Float64:

@@ -53,19 +53,8 @@ def explained(
 ) -> TofError:
     """Find the likely cause of a failed alignment.
 
-    Parameters
-    ----------
-    error
-        What was raised.
-    recording, pairs, backend
-        What was aligned, and how.
-    T_tof_stereo
-        (4, 4) that it started from.
-
-    Returns
-    -------
-    TofError
-        :class:`DataError` or :class:`ConfigError` where one cause is certain, else ``error`` with its likely cause.
+    It is a :class:`DataError` or :class:`ConfigError` where one cause is certain, else ``error`` with its likely cause.
+    ``T_tof_stereo`` (4, 4) is what the alignment started from.
     """
     failed = [p for p, refusal in zip(pairs, error.refusals, strict=True) if refusal is not None]
     for pair in failed[:TRIED]:

@@ -85,17 +85,8 @@ class _Equations:
 def joint_icp(views: Sequence[JointView], T_tof_stereo: Float64) -> JointSolution:
     """Align the cameras by one robust point-to-plane problem over all views.
 
-    Parameters
-    ----------
-    views
-        At least three.
-    T_tof_stereo
-        (4, 4) initial guess, good to a few degrees and centimetres.
-
-    Raises
-    ------
-    QualityError
-        Fewer than three views, or views that do not overlap at the initial guess.
+    ``T_tof_stereo`` (4, 4) is good to a few degrees and centimetres. :class:`QualityError` where there are fewer than three views,
+    or views that do not overlap at it.
     """
     from scipy.spatial import cKDTree
 

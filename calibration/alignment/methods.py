@@ -48,23 +48,8 @@ def apply_method(
 ) -> tuple[Rig, dict[str, Any]]:
     """Turn gated registrations into a rig.
 
-    Parameters
-    ----------
-    method
-        One of ``METHODS``.
-    recording
-        Folder of the views; the joint method reads those that were accepted again.
-    pairs, solution
-        What was registered, and the averaged solution.
-    start
-        Rig that the result keeps everything else of.
-
-    Returns
-    -------
-    rig
-        The start rig with the new ``T_tof_stereo``; the joint method adds its range errors.
-    evidence
-        What ``evidence.json`` gains.
+    The joint method reads the accepted views again from the recording. The rig is the start rig with the new ``T_tof_stereo``; the
+    joint method adds its range errors. Beside it comes what ``evidence.json`` gains.
     """
     averaged, weighted = invert(solution.average.T), _weighted(solution, solution.used)
     found, rig = {"averaged": averaged, "weighted": weighted}, start
@@ -86,12 +71,8 @@ def apply_method(
 def alignment_error(T_tof_stereo: Float64, true: Float64) -> tuple[float, float]:
     """Compare an alignment (4, 4) with the true one.
 
-    Returns
-    -------
-    rotation
-        Radians.
-    translation
-        Metres, how far a point 0.8 m in front of the ToF camera lands from where it should.
+    The rotation is in radians, the translation in metres: how far a point 0.8 m in front of the ToF camera lands from where it
+    should.
     """
     moved = T_tof_stereo @ invert(true)
     shift = transform_points(moved, np.array(TRUTH_POINT)) - TRUTH_POINT
@@ -103,14 +84,8 @@ def composed(
 ) -> tuple[RangeError, ...]:
     """Add fitted range errors to the factory's, one per frequency.
 
-    Parameters
-    ----------
-    factory
-        What was taken off before the fit; may lack frequencies.
-    modulation_hz
-        (F,) ascending.
-    coefficients
-        (U,) of :meth:`JointView.terms`; shares of scattered light have no place in a :class:`RangeError` and are left out.
+    The factory's may lack frequencies (F,). Of the coefficients (U,) of :meth:`JointView.terms`, shares of scattered light have no
+    place in a :class:`RangeError` and are left out.
     """
     known = {e.modulation_hz: e for e in factory}
     own = coefficients[: len(modulation_hz) * TERMS].reshape(-1, TERMS)
@@ -150,12 +125,8 @@ def joint_evidence(joint: JointSolution, errors: Sequence[RangeError]) -> dict[s
 def observability(information: Float64) -> tuple[Float64, Float64]:
     """Take an information (6, 6) of the twist (rho, phi) about the working point, ToF axes, apart.
 
-    Returns
-    -------
-    eigenvalues
-        (6,) ascending, 1/m^2, rotations measured as motion at ``RADIUS``.
-    motions
-        (6, 6) rows: their unit motions, (x, y, z, then rotations times ``RADIUS``).
+    The eigenvalues (6,) are ascending, 1/m^2, rotations measured as motion at ``RADIUS``. The rows of (6, 6) are their unit motions,
+    (x, y, z, then rotations times ``RADIUS``).
     """
     scale = np.repeat([1.0, 1 / RADIUS], 3)
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))

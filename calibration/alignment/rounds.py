@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -56,7 +56,7 @@ class RangeResidual:
     modulation_hz: float  #: The frequency whose wave number the orders are multiples of
     #: (T,) float64 of :data:`calibration.range_error.error.SIMPLE`: offset in metres, metres per pixel
     #: of radius, cosine and sine amplitude of each order in metres
-    coefficients: Float64
+    coefficients: Float64 = field(default_factory=lambda: np.zeros(len(SIMPLE)))
 
     def correct(self, points: Float64) -> Float64:
         """Move points (N, 3) of the ToF frame along their rays to where they would be without the error."""
@@ -69,11 +69,6 @@ class RangeResidual:
         focal = [self.camera.fx, self.camera.fy]
         radius = np.linalg.norm(points[:, :2] / points[:, 2:] * focal, axis=-1)
         return Terms(self.modulation_hz).columns(np.linalg.norm(points, axis=-1), radius)
-
-
-def no_residual(camera: Camera, modulation_hz: float) -> RangeResidual:
-    """Start from no range error."""
-    return RangeResidual(camera, modulation_hz, np.zeros(len(PRIOR)))
 
 
 @dataclass(frozen=True)
@@ -102,24 +97,11 @@ def solve(
 ) -> Solution:
     """Align cloud pairs: register, gate, average; then take off the common range error and do it again, twice.
 
-    Parameters
-    ----------
-    pairs
-        N >= 3 cloud pairs.
-    backend
-        Name of a registration backend.
-    T_tof_stereo
-        (4, 4) initial guess.
-    progress
-        Called with a stage, steps done and steps in all.
-
-    Raises
-    ------
-    RefusedPairsError
-        Fewer than three pairs pass the gate or survive as inliers.
+    ``T_tof_stereo`` (4, 4) is the initial guess; ``progress`` is called with a stage, steps done and steps in all.
+    :class:`RefusedPairsError` where fewer than three pairs pass the gate or survive as inliers.
     """
     guess = T = invert(T_tof_stereo)
-    residual = no_residual(pairs[0].rig.tof, pairs[0].modulation_hz)
+    residual = RangeResidual(pairs[0].rig.tof, pairs[0].modulation_hz)
     distances: Sequence[float] = COARSE_TO_FINE
     with Pool(1, pinned=True) as pool:
         for n in range(1 + REFINEMENTS):
@@ -184,48 +166,24 @@ def demand_pairs(good: int, refusals: Sequence[Refusal | None]) -> None:
 def fit_range_residual(
     pairs: Sequence[Pair], registrations: Sequence[Registration], start: RangeResidual
 ) -> RangeResidual:
-    """Estimate the range error from registered pairs.
+    """Estimate the range error from pairs, already corrected by ``start``, and their registrations.
 
     One linear least-squares problem in the shared coefficients and in a small motion of every pair, without which a pair's
     wrong pose would be explained by waves. Robust by Tukey's weights; a Gaussian prior keeps what the ranges at hand do not
     determine at zero.
-
-    Parameters
-    ----------
-    pairs
-        As already corrected by ``start``.
-    registrations
-        Result of each pair.
-    start
-        What was corrected before.
-
-    Returns
-    -------
-    RangeResidual
-        Start plus the correction found.
     """
     H = np.diag((NOISE / PRIOR) ** 2)
     g = -H @ start.coefficients
     for pair, result in zip(pairs, registrations, strict=True):
-        H_pair, g_pair = _pair_equations(pair, result, start)
-        H += H_pair
-        g += g_pair
+        source = pair.source[::STRIDE]
+        found = residuals(source, pair.target, result.T_target_source)
+        points = source[found.source]
+        rays = points / np.linalg.norm(points, axis=-1)[:, None] @ result.T_target_source[:3, :3].T
+        waves = start.terms(points) * (found.normals * rays).sum(axis=-1)[:, None]
+        J, weights = found.jacobian(result.centre), tukey_weights(found.distance)[:, None]
+        # Schur complement: what the pair's own motion explains is taken out.
+        motion = np.linalg.pinv((J * weights).T @ J)
+        cross = (waves * weights).T @ J
+        H += (waves * weights).T @ waves - cross @ motion @ cross.T
+        g += (waves * weights).T @ found.distance - cross @ motion @ ((J * weights).T @ found.distance)
     return replace(start, coefficients=start.coefficients + np.linalg.solve(H, g))
-
-
-def _pair_equations(pair: Pair, result: Registration, start: RangeResidual) -> tuple[Float64, Float64]:
-    source = pair.source[::STRIDE]
-    found = residuals(source, pair.target, result.T_target_source)
-    points = source[found.source]
-    radial = np.linalg.norm(points, axis=-1)
-    rays = points / radial[:, None] @ result.T_target_source[:3, :3].T
-    along = (found.normals * rays).sum(axis=-1)
-    waves = start.terms(points) * along[:, None]
-    weights = tukey_weights(found.distance)[:, None]
-    J = found.jacobian(result.centre)
-    # Schur complement: what the pair's own motion explains is taken out.
-    motion = np.linalg.pinv((J * weights).T @ J)
-    cross = (waves * weights).T @ J
-    H = (waves * weights).T @ waves - cross @ motion @ cross.T
-    g = (waves * weights).T @ found.distance - cross @ motion @ ((J * weights).T @ found.distance)
-    return H, g

@@ -25,14 +25,8 @@ from tofcapture.record.board_meter import CELLS, SECTORS, TILTED, TILTS
 def coverage(poses: Sequence[Float64], camera: Camera, outline: Float64) -> dict[str, Any]:
     """Say what the views so far cover.
 
-    Parameters
-    ----------
-    poses
-        N of (4, 4) ``T_tof_board``: the board's origin and, along its z, the normal of its front.
-    camera
-        ToF intrinsics.
-    outline
-        (M, 2) of the board, metres; or (N, M, 2), one for each view.
+    The poses (4, 4) are ``T_tof_board``: the board's origin and, along its z, the normal of its front. The outline is (M, 2), metres,
+    or (N, M, 2), one for each view.
 
     Returns
     -------
@@ -117,10 +111,7 @@ def recorded_poses(recording: Path) -> tuple[list[Float64], Camera]:
 
     The turn of the board in its plane is taken as that of the horizontal: it does not matter for a tilt, and little for the image.
 
-    Raises
-    ------
-    DataError
-        No views, or a recording without a station.
+    :class:`DataError` where there are no views, or no station.
     """
     path = Path(recording) / "station.toml"
     try:

@@ -113,14 +113,7 @@ def stereo_sight(frame: StereoFrame) -> Sight:
 def detect(sight: Sight, board: Board, camera: Camera) -> Detection:
     """Find a board.
 
-    Parameters
-    ----------
-    sight
-        Rims and surface of one camera; ranges may be wrong by a centimetre in common.
-    board
-        Its geometry.
-    camera
-        Intrinsics, for what lies in the image.
+    The sight's ranges may be wrong by a centimetre in common; the camera's intrinsics say what lies in the image.
 
     Raises
     ------

@@ -13,7 +13,7 @@ import numpy as np
 from calibration.board.geometry import Board, load_board, symmetries
 from tofcapture.command import Outcome
 from tofcapture.errors import ConfigError
-from tofcapture.files.seal import replacing, write_text
+from tofcapture.files.seal import replacing
 from tofcapture.meshes import extrude, signed_area
 from tofcapture.poses import Float64
 
@@ -95,14 +95,12 @@ def run_board(args: argparse.Namespace) -> Outcome:
     """Check a board, describe it, and write the drawings that were asked for."""
     board = load_board(args.board)
     written = {}
-    for kind, draw in (("svg", svg), ("dxf", dxf)):
+    for kind, draw in (("svg", svg), ("dxf", dxf), ("stl", stl)):
         if (out := getattr(args, kind)) is not None:
-            write_text(out, draw(board))
+            with replacing(out) as partial:
+                drawn = draw(board)
+                partial.write_bytes(drawn if isinstance(drawn, bytes) else drawn.encode())
             written[kind] = str(out)
-    if args.stl is not None:
-        with replacing(args.stl) as partial:
-            partial.write_bytes(stl(board))
-        written["stl"] = str(args.stl)
     data = {**describe(board), "written": written}
     return Outcome(data, "\n".join([_table(board), *written.values()]))
 
@@ -113,16 +111,12 @@ def describe(board: Board) -> dict[str, Any]:
         "name": board.name,
         "size_m": np.ptp(board.outline, axis=0).tolist(),
         "thickness_m": board.thickness,
-        "volume_m3": _area(board) * board.thickness,
+        "volume_m3": (signed_area(board.outline) - sum(map(signed_area, board.rings[1:]))) * board.thickness,
         "holes": [
             {"name": h.name, "radius_m": h.radius or None, "corners": len(h.corners)} for h in board.holes
         ],
         "symmetries": symmetries(board),
     }
-
-
-def _area(board: Board) -> float:
-    return signed_area(board.outline) - sum(signed_area(hole.corners) for hole in board.holes)
 
 
 def _table(board: Board) -> str:

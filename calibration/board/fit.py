@@ -166,16 +166,8 @@ class Fit:
 def refine(model: Model, sight: Sight, T: Float64, scales: Sequence[float] = SCALES) -> Fit:
     """Fit a pose by Gauss-Newton with Tukey's weights on the rims, coarse to fine.
 
-    Parameters
-    ----------
-    model
-        The board.
-    sight
-        Rims and surface of one plane.
-    T
-        (4, 4) ``T_camera_board`` to within 2 cm and 4 degrees.
-    scales
-        Tukey's scales, metres, descending.
+    ``T`` (4, 4) is ``T_camera_board`` to within 2 cm and 4 degrees, the sight that of one plane. ``scales`` are Tukey's, metres,
+    descending.
     """
     nuisance = np.zeros(UNKNOWNS - 6)
     prior = np.diag([0.0] * 6 + [1 / sight.bias_sigma**2, 1 / GROWTH_SIGMA**2])

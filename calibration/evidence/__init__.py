@@ -1,0 +1,181 @@
+"""What an alignment rests on, as JSON: residuals of every pair, the spread, every number judged, and the error where the truth is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from calibration.alignment.methods import alignment_error
+from calibration.alignment.rounds import Solution
+from calibration.limits import Judged, judged, worst
+from calibration.range_error.error import Terms
+from calibration.registration.pairs import Pair
+from tofcapture.errors import DataError
+from tofcapture.files.seal import write_text
+from tofcapture.poses import Float64, invert, rotation_angle, transform_points
+from tofcapture.rig import RangeError
+
+FORMAT = "tofcapture-evidence"
+ASIDE = 0.1  # m from the working point at which the least certain motion is stated
+
+
+def evidence_of(
+    pairs: Sequence[Pair],
+    solution: Solution,
+    backend: str,
+    initial: Float64,
+    T_tof_stereo: Float64,
+    found: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Assemble ``evidence.json``.
+
+    All are JSON types; lengths in metres but where a name ends in ``_mm``, angles in degrees. ``initial`` and ``T_tof_stereo``
+    (4, 4) are the start and the result. What the method has ``found`` of itself, as its standard error, replaces the average's.
+    """
+    rows = [_pair(i, pair, solution) for i, pair in enumerate(pairs)]
+    true = pairs[0].truth
+    evidence = {
+        "format": FORMAT,
+        "version": 1,
+        "backend": backend,
+        "views": len(pairs),
+        "used": len(solution.used),
+        "T_tof_stereo": T_tof_stereo.tolist(),
+        "initial_T_tof_stereo": initial.tolist(),
+        "spread": _degrees_mm(*solution.average.spread),
+        "standard_error": _degrees_mm(*solution.average.standard_error),
+        "working_point_m": solution.working_point.tolist(),
+        "range_residual": _range_residual(solution),
+        "pairs": rows,
+        "truth": None if true is None else _degrees_mm(*alignment_error(T_tof_stereo, true), "_error"),
+        "provenance": {
+            "versions": _versions(backend),
+            "inputs": {pair.name: pair.sha256 for pair in pairs},
+        },
+        **found,
+    }
+    checks = judged_evidence(evidence)
+    return {
+        **evidence,
+        "verdict": worst([c.verdict for c in checks]),
+        "checks": [asdict(c) for c in checks],
+    }
+
+
+def judged_evidence(evidence: Mapping[str, Any]) -> list[Judged]:
+    """Judge the views, their spread, the certainty, the start, and the error where the truth is known."""
+    used = [p for p in evidence["pairs"] if p["accepted"]]
+    out = [
+        judged("used", evidence["used"]),
+        judged("rmse", median([p["rmse_mm"] for p in used]) if used else None),
+        judged("condition", max((p["condition"] for p in used), default=None)),
+    ]
+    out += _both("spread", evidence["spread"]) + _both("error", evidence["standard_error"])
+    if (C := covariance_of(evidence)) is not None:
+        scale = np.repeat([1.0, ASIDE], 3)
+        sigma = np.sqrt(np.linalg.eigvalsh(C * np.outer(scale, scale))[-1])
+        out.append(judged("uncertain_motion", 1e3 * float(sigma)))
+    moved = np.asarray(evidence["initial_T_tof_stereo"]) @ invert(np.asarray(evidence["T_tof_stereo"]))
+    point = np.asarray(evidence["working_point_m"], dtype=np.float64)
+    shift = float(np.linalg.norm(transform_points(moved, point) - point))
+    out += _both("initial", _degrees_mm(rotation_angle(moved), shift))
+    if truth := evidence["truth"]:
+        out += _both("truth", truth, "_error")
+    return out
+
+
+def covariance_of(evidence: Mapping[str, Any]) -> Float64 | None:
+    """Return the (6, 6) covariance that an evidence states, of (rho, phi) at the working point, m^2 and rad^2; None: it states none."""
+    given = evidence.get("covariance")
+    return None if given is None else np.asarray(given, dtype=np.float64)
+
+
+def read_evidence(recording: Path) -> dict[str, Any]:
+    """Read ``evidence.json`` of a recording; :class:`DataError` where it is missing, not JSON, or something else."""
+    path = Path(recording) / "evidence.json"
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as err:
+        raise DataError(
+            f"{path}: cannot read the evidence: {err}", hint=f"tofcapture align {recording}"
+        ) from err
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise DataError(f"{path}: expected format {FORMAT}", hint=f"tofcapture align {recording}")
+    return found
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write a result; numbers keep every bit."""
+    write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+
+def _degrees_mm(rotation: float, translation: float, suffix: str = "") -> dict[str, float]:
+    return {
+        f"rotation{suffix}_deg": float(np.degrees(rotation)),
+        f"translation{suffix}_mm": 1e3 * float(translation),
+    }
+
+
+def _both(key: str, found: Mapping[str, float], suffix: str = "") -> list[Judged]:
+    return [
+        judged(f"{key}_rotation", found[f"rotation{suffix}_deg"]),
+        judged(f"{key}_translation", found[f"translation{suffix}_mm"]),
+    ]
+
+
+def _range_residual(solution: Solution) -> dict[str, Any]:
+    hz = solution.residual.modulation_hz
+    error = Terms(hz).added(RangeError(hz), solution.residual.coefficients)
+    return {
+        "modulation_hz": hz,
+        "offset": error.offset,
+        "per_pixel_radius": error.per_pixel_radius,
+        "harmonics": [list(wave) for wave in error.harmonics],
+    }
+
+
+def _pair(i: int, pair: Pair, solution: Solution) -> dict[str, Any]:
+    result, refusal, average = solution.registrations[i], solution.refusals[i], solution.average
+    accepted = i in solution.used
+    out = {
+        "view": pair.name,
+        "accepted": accepted,
+        "reason": str(refusal) if refusal else ("" if accepted else "outlier"),
+        "rmse_mm": _finite(1e3 * result.rmse),
+        "inliers": result.inliers,
+        "fitness": result.fitness,
+        "condition": _finite(result.condition),
+        "rotation_from_mean_deg": None,
+        "translation_from_mean_mm": None,
+    }
+    if i in solution.passed:
+        k = solution.passed.index(i)
+        out["rotation_from_mean_deg"] = float(np.degrees(average.rotation_from_mean[k]))
+        out["translation_from_mean_mm"] = 1e3 * float(average.translation_from_mean[k])
+    return out
+
+
+def _versions(backend: str) -> dict[str, str]:
+    out = {}
+    for name in (
+        "tofcapture",
+        "numpy",
+        "scipy",
+        *(("open3d-cpu", "open3d") if backend == "open3d" else (backend,)),
+    ):
+        try:
+            out[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return out
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.evidence.evidence import covariance_of
+from calibration.evidence import covariance_of
 from calibration.limits import LIMITS, SIGNIFICANT, worst
 from tofcapture.poses import Float64, check_transform, invert, rotation_log, transform_points
 from tofcapture.rig import load_rig
@@ -58,10 +58,7 @@ class OldRig:
 def load_old(path: Path) -> OldRig:
     """Read an older ``rig.toml``, and the ``evidence.json`` beside it where that is of this rig.
 
-    Raises
-    ------
-    ConfigError
-        The file is no rig.
+    :class:`ConfigError` where the file is no rig.
     """
     T = load_rig(path).T_tof_stereo
     try:

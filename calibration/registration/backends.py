@@ -36,18 +36,9 @@ def register(
 ) -> Registration:
     """Register by the backend of that name and measure the result with our own code.
 
-    Parameters
-    ----------
-    backend
-        One of ``BACKENDS``.
-    source
-        (N, 3) finite, source frame, metres.
-    target
-        Dense cloud with normals, target frame.
-    initial
-        (4, 4) ``T_target_source`` to start from; the result stays there where the clouds are empty.
-    distances
-        Correspondence distances, metres, descending; also the scale of a robust kernel.
+    The source (N, 3), finite, source frame, metres, goes into the dense target from ``initial`` (4, 4), ``T_target_source``, and
+    stays there where the clouds are empty. ``distances`` are correspondence distances, metres, descending, and the scale of a
+    robust kernel.
 
     Raises
     ------

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.errors import DataError
 from tofcapture.frames import StereoFrame, TofBurst
 from tofcapture.ops import phase
 from tofcapture.poses import Float64
@@ -35,12 +34,6 @@ class Cloud:
     #: (N, 3) float64, unit: of a surface, facing the camera at the origin of the points' frame; of a
     #: rim, across it
     normals: Float64
-
-    def __post_init__(self) -> None:
-        if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.shape != self.normals.shape:
-            raise DataError(
-                f"cloud: expected points and normals (N, 3), got {self.points.shape}, {self.normals.shape}"
-            )
 
     def __len__(self) -> int:
         return len(self.points)

@@ -101,10 +101,7 @@ def tukey_weights(distance: Float64, scale: float | Float64 = INLIER_DISTANCE) -
 def check_clouds(source: Float64, target: Cloud) -> Refusal | None:
     """Say ``EMPTY`` when either side has too few points to register.
 
-    Raises
-    ------
-    DataError
-        When the source is not (N, 3) finite numbers: some libraries drop such rows silently.
+    :class:`DataError` when the source is not (N, 3) finite numbers: some libraries drop such rows silently.
     """
     if source.ndim != 2 or source.shape[1] != 3 or not np.isfinite(source).all():
         raise DataError(f"source points: expected finite (N, 3), got shape {source.shape}")
@@ -142,21 +139,10 @@ def _nothing(T: Float64, inliers: int, fitness: float) -> Registration:
 def check_registration(
     result: Registration, source: Float64, target: Cloud, initial: Float64
 ) -> Refusal | None:
-    """Gate a measured registration.
+    """Gate a registration measured on these clouds.
 
-    Parameters
-    ----------
-    result
-        From :func:`measure_registration`.
-    source, target
-        The clouds it was measured on.
-    initial
-        (4, 4) ``T_target_source`` that the operator believes to about 2 degrees and 2 cm.
-
-    Returns
-    -------
-    Refusal or None
-        The first reason not to believe it, None when it passes.
+    ``initial`` (4, 4) is the ``T_target_source`` that the operator believes to about 2 degrees and 2 cm. The answer is the first
+    reason not to believe the result, None when it passes.
     """
     if check_clouds(source, target) is not None:
         return Refusal.EMPTY

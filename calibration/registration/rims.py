@@ -63,14 +63,7 @@ class Rims:
 def tof_rims(phasor: Complex128, depth: Float64, camera: Camera) -> Rims:
     """Find rims in a ToF image, ToF frame.
 
-    Parameters
-    ----------
-    phasor
-        (F, H, W), burst-averaged.
-    depth
-        (H, W) metres, NaN where it cannot be decoded.
-    camera
-        Intrinsics.
+    The phasor (F, H, W) is burst-averaged; the depth (H, W), metres, is NaN where it cannot be decoded.
     """
     return _rims_in(phasor, depth, camera, lambda z, d, _axis, _sign: _mixed_steps(z, d))
 
@@ -141,12 +134,7 @@ def square_rims(rims: Rims, surface: Cloud, seen_from: Float64) -> Cloud:
     Where a camera looks at the cut of a thick board, the front ends at the board's rear edge for it, or on the way there. Where
     both see past the front's edge, both see the same line in space. The cut is taken to be square to the front.
 
-    Parameters
-    ----------
-    rims, surface
-        Of the stereo camera, stereo frame; the fronts are among the surface.
-    seen_from
-        (3,) ToF camera in the stereo frame, metres; centimetres suffice.
+    All is in the stereo frame; the fronts are among the surface. ``seen_from`` is that of :func:`rim_cloud`.
     """
     from scipy.spatial import cKDTree
 

@@ -46,8 +46,8 @@ def write_page(
     DataError
         No readable evidence or views.
     """
+    from calibration.evidence import read_evidence
     from calibration.evidence.compare import drift
-    from calibration.evidence.evidence import read_evidence
     from calibration.evidence.page.content import page_content
     from calibration.evidence.page.samples import sample_recording
     from tofcapture.files.seal import write_text

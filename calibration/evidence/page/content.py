@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from calibration.board.coverage import coverage
+from calibration.evidence import covariance_of
 from calibration.evidence.compare import Drift
-from calibration.evidence.evidence import covariance_of
 from calibration.evidence.page import charts, checks
 from calibration.evidence.page.samples import Samples, residual_from
 from calibration.limits import LIMITS, Judged, worst

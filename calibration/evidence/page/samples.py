@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.alignment.rounds import RangeResidual, no_residual
+from calibration.alignment.rounds import RangeResidual
 from calibration.range_error.error import SIMPLE
 from calibration.registration.clouds import stereo_cloud, surface_points, tof_depth
 from calibration.registration.gate import residuals
@@ -99,7 +99,7 @@ def residual_from(evidence: Mapping[str, Any], camera: Camera) -> RangeResidual:
     """Read the range residual that an evidence states; none where it states none."""
     table = evidence.get("range_residual")
     if table is None:
-        return no_residual(camera, 100e6)
+        return RangeResidual(camera, 100e6)
     found = {"offset": table["offset"], "radius": table["per_pixel_radius"]}
     for m, a, b in table["harmonics"]:
         found |= {f"cos {m}": a, f"sin {m}": b}
