@@ -7,7 +7,6 @@ tests/test_daemon_browser.py``).
 from __future__ import annotations
 
 import shutil
-import subprocess
 import sys
 import tempfile
 import threading
@@ -16,43 +15,25 @@ from pathlib import Path
 PICTURES = Path(__file__).parent / "pictures"
 SITE = Path(__file__).parent.parent / "build" / "docs" / "index.html"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+SHEETS = {"dataset": "view-sheet", "recording": "view-recording", "recording/rig.toml": "view-calibration"}
 RERUN_SECONDS = 30  # until a software renderer has drawn the space
 
 
-def sheets(demo: Path) -> None:
-    """Draw the contact sheets."""
-    for what, name in (
-        ("dataset", "view-sheet"),
-        ("recording", "view-recording"),
-        ("recording/rig.toml", "view-calibration"),
-    ):
-        words = [
-            sys.executable,
-            "-m",
-            "tofcapture",
-            "view",
-            demo / what,
-            "--png",
-            PICTURES / f"{name}.png",
-            "--views",
-            "5",
-        ]
-        subprocess.run(words, check=True)
-
-
-def pages(demo: Path) -> None:
-    """Photograph Rerun, the report and the site's home."""
+def pictures(demo: Path) -> None:
+    """Draw the contact sheets, and photograph Rerun, the report and the site's home."""
     from playwright.sync_api import sync_playwright
 
-    from tofcapture.viz.web import make_server
+    from tofcapture.cli import main
+    from tofcapture.viz.web import page_server
 
+    for what, name in SHEETS.items():
+        main(["view", str(demo / what), "--png", str(PICTURES / f"{name}.png"), "--views", "5"])
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
         rrd = Path(folder) / "view.rrd"
-        words = [sys.executable, "-m", "tofcapture", "view", demo / "dataset", "--save", rrd, "--views", "8"]
-        subprocess.run(words, check=True)
+        main(["view", str(demo / "dataset"), "--save", str(rrd), "--views", "8"])
         browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         page = browser.new_page(viewport={"width": 1200, "height": 800})
-        with make_server(rrd, 0) as server:
+        with page_server(rrd, 0) as server:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             page.goto(f"http://127.0.0.1:{server.server_port}")
             page.wait_for_timeout(1000 * RERUN_SECONDS)
@@ -66,5 +47,4 @@ def pages(demo: Path) -> None:
 
 
 if __name__ == "__main__":
-    sheets(Path(sys.argv[1]))
-    pages(Path(sys.argv[1]))
+    pictures(Path(sys.argv[1]))

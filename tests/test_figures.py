@@ -20,7 +20,7 @@ from tofcapture.poses import look_at
 from tofcapture.rig import dumps_rig
 from tofcapture.viz.figures.clouds import eye_for, splat
 from tofcapture.viz.figures.preprocessing import gap, preprocess
-from tofcapture.viz.figures.scenes import Maps, object_window, read_rows
+from tofcapture.viz.figures.scenes import Maps, read_rows
 
 pytest.importorskip("matplotlib")
 
@@ -138,8 +138,8 @@ def test_a_perfect_prediction_has_no_error(dataset):
     rows = read_rows(dataset, None, 0, 2, dataset.parent / "predictions")
     assert [row.name.split()[0] for row in rows] == ["box", "mug"]
     for row in rows:
-        assert np.nanmax(np.abs(row.prediction.error_mm)) == 0
-        rows, columns = object_window(row.truth.mask == 0)
+        assert np.nanmax(np.abs(row.methods["prediction"].error_mm)) == 0
+        rows, columns = row.window
         inside = np.zeros(row.truth.mask.shape, bool)
         inside[rows, columns] = True
         assert inside[row.truth.mask == 0].mean() > 0.95

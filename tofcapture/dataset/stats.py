@@ -173,14 +173,7 @@ class DatasetStats:
 def dataset_stats(
     dataset: Path, progress: Callable[[int, int], None] = lambda _done, _total: None
 ) -> DatasetStats:
-    """Count a dataset in one pass over its shards.
-
-    Parameters
-    ----------
-    dataset
-        Folder with a manifest.
-    progress
-        Told views done and views in all.
+    """Count a dataset in one pass over its shards; ``progress`` is told views done and views in all.
 
     Raises
     ------

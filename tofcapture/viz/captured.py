@@ -123,17 +123,7 @@ def arm_of(recording: Path) -> ArmModel | None:
 
 
 def view_shot(view: View, rig: Rig, arm: ArmModel | None = None) -> Shot:
-    """Decode a view and put its stereo points beside it.
-
-    Parameters
-    ----------
-    view
-        As it was captured.
-    rig
-        Brings stereo points into the ToF frame.
-    arm
-        Gives the links; ``None``: none.
-    """
+    """Decode a view and bring its stereo points into the ToF frame by a rig; an arm gives the links."""
     burst = view.tof
     maps = Decoder(burst.info).burst(burst.raw, float(np.mean(burst.celsius)))
     grid = view.stereo.points[::_STEREO_STEP, ::_STEREO_STEP]

@@ -76,20 +76,9 @@ def chart(
     size: tuple[float, float] = _SIZE,
     **axes: Any,
 ) -> str:
-    """Draw one chart as an SVG element of a page.
+    """Draw one chart as an SVG element of a page; ``words`` say what it shows to those who cannot see it.
 
-    Parameters
-    ----------
-    draw
-        Draws on the axes.
-    words
-        What it shows, for those who cannot see it.
-    x, y
-        Labels of the axes.
-    size
-        Inches.
-    axes
-        Options of the axes.
+    ``x`` and ``y`` label the axes, ``size`` is in inches, ``axes`` are options of the axes.
     """
     with canvas(_INK) as figure:
         figure.set_size_inches(size)
@@ -122,18 +111,9 @@ def svg_text(figure: Any, *, transparent: bool = False) -> str:
 def scatter(
     x: Float64, y: Float64, x_words: str, y_words: str, limit: float, *, logarithmic: bool = False
 ) -> str:
-    """Draw dots with the median and the quartiles of twelve bins of equal size; "" for fewer than 20 points.
+    """Draw dots (N,) with the median and the quartiles of twelve bins of equal size; "" for fewer than 20.
 
-    Parameters
-    ----------
-    x, y
-        (N,).
-    x_words, y_words
-        Axes.
-    limit
-        The y axis runs from ``-limit`` to ``limit``; dots beyond are drawn at its ends.
-    logarithmic
-        Of the x axis.
+    The y axis runs from ``-limit`` to ``limit``; dots beyond are drawn at its ends.
     """
     if len(x) < 20:
         return ""

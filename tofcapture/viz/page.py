@@ -30,19 +30,7 @@ _NORMAL_STEP = 4  # colours of normals in steps of 4 of 256: a degree or two, an
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture of a page.
-
-    Attributes
-    ----------
-    title, note
-        Its caption, and a few words below it.
-    alt
-        What it shows, for those who cannot see it.
-    uri
-        ``data:`` address of a PNG.
-    width, height
-        Pixels.
-    """
+    """One picture of a page: its caption, words below it and for those who cannot see it, its ``data:`` address, pixels."""
 
     title: str
     note: str
@@ -94,16 +82,7 @@ def mask_legend(mask: NDArray[np.uint8]) -> list[tuple[str, str, str]]:
 
 
 def write_page(template: Path, out: Path, content: Mapping[str, Any]) -> Path:
-    """Write a page that extends ``base.html.j2``; the same content gives the same bytes.
-
-    Parameters
-    ----------
-    template
-        File of the page's own part.
-    out
-        The page, written atomically.
-    content
-        What the template prints; everything but SVG is escaped.
+    """Write a page whose template extends ``base.html.j2``; everything but SVG is escaped. Same content, same bytes.
 
     Raises
     ------

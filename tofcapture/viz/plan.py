@@ -27,16 +27,7 @@ _SIDES = (((0, 1), "from above"), ((0, 2), "from the side"))
 def write_plan(plan: Plan, stage: Stage, rig: Rig, target: Float64, title: str, out: Path) -> None:
     """Draw a plan as SVG: from above (x, y) and from the side (x, z) in the base frame, at one scale.
 
-    Parameters
-    ----------
-    plan, stage, rig
-        What is drawn; :attr:`Plan.tried` gives the refused candidates, if it is there.
-    target
-        (3,) what the views look at, base frame, metres.
-    title
-        Stands above.
-    out
-        The file, replaced when it exists.
+    The views look at ``target`` (3,), base frame, metres. The file is replaced when it exists.
     """
     low, high = _bounds(plan, stage, rig, target)
     middle, reach = (low + high) / 2, float((high - low).max()) / 2

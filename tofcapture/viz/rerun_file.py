@@ -32,22 +32,9 @@ def _load_rerun() -> Any:
 
 
 def write_rrd(source: Source, path: Path, most: int, progress: Callable[[int, int], None]) -> int:
-    """Write a source as ``.rrd``.
+    """Write a source as ``.rrd`` with at most so many shots, spread evenly; returns their number.
 
-    Parameters
-    ----------
-    source
-        What to show.
-    path
-        Of the file; replaced when it exists.
-    most
-        Largest number of shots; more are thinned out evenly.
-    progress
-        Told how many shots of how many are written.
-
-    Returns
-    -------
-    Number of shots in it.
+    ``progress`` is told how many shots of how many are written.
 
     Raises
     ------

@@ -16,22 +16,9 @@ _KEYS: Mapping[str, Any] = {"normals": NORMAL_KEY, "mask": _MASK, "depth": DEPTH
 
 
 def write_sheet(source: Source, path: Path, most: int, progress: Callable[[int, int], None]) -> int:
-    """Write a contact sheet as PNG.
+    """Write a contact sheet as PNG with at most so many shots, spread evenly; returns their number.
 
-    Parameters
-    ----------
-    source
-        What to show.
-    path
-        Of the PNG; replaced when it exists.
-    most
-        Largest number of shots; more are thinned out evenly.
-    progress
-        Told how many shots of how many are read.
-
-    Returns
-    -------
-    Number of shots on it.
+    ``progress`` is told how many shots of how many are read.
     """
     picked = source.spread(most)
     shots = []

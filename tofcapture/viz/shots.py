@@ -19,19 +19,10 @@ Kind = Literal[ScaleKind, "normals", "mask"]
 
 @dataclass(frozen=True)
 class Panel:
-    """One picture.
+    """One picture: values (H, W), or (H, W, 3) for normals, NaN: none; and where the object is, if that is known.
 
-    Attributes
-    ----------
-    title
-        Few words.
-    kind
-        Decides colours and unit: ``depth`` metres, ``amplitude`` raw units, ``error`` signed and ``expected`` unsigned
-        millimetres, ``normals`` unit vectors, ``mask`` bits of ground truth.
-    values
-        (H, W) in that unit, or (H, W, 3) for normals; NaN: none.
-    on_object
-        (H, W), where the object is; ``None``: unknown.
+    Its kind decides colours and unit: ``depth`` metres, ``amplitude`` raw units, ``error`` signed and ``expected`` unsigned
+    millimetres, ``normals`` unit vectors, ``mask`` bits of ground truth.
     """
 
     title: str
@@ -61,18 +52,8 @@ class Cloud:
 class Shot:
     """One row of a sheet, one step of the timeline.
 
-    Attributes
-    ----------
-    name
-        Scene and number.
-    panels
-        Pictures, in the order in which they are shown.
-    clouds
-        By name, in the ToF frame.
-    T_base_tof
-        (4, 4); ``None`` where no arm is known.
-    links
-        (7, 3) origins of the arm's links in the base frame, metres, from the base to the flange; ``None`` where unknown.
+    ``T_base_tof`` is (4, 4) and ``links`` (7, 3) the origins of the arm's links in the base frame, metres, from the base to
+    the flange; both are ``None`` where no arm is known.
     """
 
     name: str
@@ -92,20 +73,9 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Source:
-    """Everything that a path has to show; shots are read when they are asked for.
+    """Everything that a path has to show: names of the shots, ``load`` reads shot ``i`` when it is asked for.
 
-    Attributes
-    ----------
-    title
-        Kind and name.
-    names
-        Of the shots.
-    load
-        Reads shot ``i``.
-    rig
-        Where the cameras sit; ``None`` when the file does not say.
-    calibration
-        Of an alignment only.
+    ``rig`` says where the cameras sit, if the file does; only an alignment has a ``calibration``.
     """
 
     title: str

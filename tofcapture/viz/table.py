@@ -45,20 +45,9 @@ class Column:
 def draw_table(
     figure: Any, title: str, names: Sequence[str], columns: Sequence[Column], aspect: float
 ) -> None:
-    """Fill a figure; adjacent columns of one scale share its colour bar.
+    """Fill a figure and set its size; adjacent columns of one scale share its colour bar.
 
-    Parameters
-    ----------
-    figure
-        Of matplotlib; its size is set.
-    title
-        Above.
-    names
-        Of the rows.
-    columns
-        From left to right.
-    aspect
-        Width over height of every cell.
+    ``names`` are those of the rows, ``aspect`` is width over height of every cell.
     """
     width = (WIDTH - _LEFT - 0.05) / len(columns) - _GAP
     tall = width / aspect

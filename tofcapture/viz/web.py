@@ -16,10 +16,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 from urllib.error import URLError
 from urllib.request import ProxyHandler, build_opener
 
@@ -27,8 +29,8 @@ from tofcapture.errors import ConfigError, DeviceError
 
 LOOPBACK = "127.0.0.1"
 PORT = 9090
-_DATA = "/view.rrd"
-_ASSETS = ("/index.html", "/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico")
+_DATA = "view.rrd"
+_ASSETS = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
 _PATIENCE = 20.0  # s until Rerun's own server answers
 _POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
@@ -40,7 +42,6 @@ const own = window.fetch;
 window.fetch = (what, ...rest) => new URL(what.url ?? what, location).origin === location.origin
   ? own(what, ...rest) : Promise.resolve(new Response(null, { status: 204 }));
 </script>"""
-_TYPES = {".html": "text/html", ".js": "text/javascript", ".wasm": "application/wasm", ".ico": "image/x-icon"}
 
 
 def _program() -> str:
@@ -55,11 +56,9 @@ def _program() -> str:
 
 def quiet_environment(folder: Path) -> dict[str, str]:
     """Environment in which Rerun reports nothing; its configuration is put into an empty folder."""
-    config = folder / "rerun" / "analytics.json"
-    config.parent.mkdir(parents=True)
-    config.write_text(
-        json.dumps({"analytics_enabled": False, "analytics_id": "", "metadata": {}}), encoding="utf-8"
-    )
+    said = {"analytics_enabled": False, "analytics_id": "", "metadata": {}}
+    (folder / "rerun").mkdir()
+    (folder / "rerun" / "analytics.json").write_text(json.dumps(said), encoding="utf-8")
     return {**os.environ, "XDG_CONFIG_HOME": str(folder), "RUST_LOG": "error"}
 
 
@@ -92,8 +91,8 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def page_files() -> dict[str, bytes]:
-    """Take Rerun's page from its own server: path -> bytes, without what it would load from elsewhere.
+def save_page(folder: Path) -> None:
+    """Take Rerun's page from its own server into a folder, without what it would load from elsewhere.
 
     Raises
     ------
@@ -102,31 +101,32 @@ def page_files() -> dict[str, bytes]:
     DeviceError
         Its server does not answer.
     """
-    with tempfile.TemporaryDirectory(prefix="tofcapture-view-") as folder:
+    with tempfile.TemporaryDirectory(prefix="tofcapture-view-") as quiet:
         port = _free_port()
         bound = ("--bind", LOOPBACK, "--port", str(_free_port()))
         process = subprocess.Popen(
             [_program(), *bound, "--serve-web", "--web-viewer-port", str(port)],
-            env=quiet_environment(Path(folder)),
+            env=quiet_environment(Path(quiet)),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
         try:
-            files = {name: _asked(port, name) for name in _ASSETS}
+            for name in _ASSETS:
+                (folder / name).write_bytes(_asked(port, name))
         finally:
             os.killpg(process.pid, signal.SIGTERM)  # `rerun` is a script that starts the program proper
             process.wait(timeout=10)
-    page = re.sub(r"<link[^>]*https://[^>]*>", "", files["/index.html"].decode())
-    files["/index.html"] = page.replace("<head>", "<head>" + _GUARD, 1).encode()
-    return files
+    page = folder / "index.html"
+    text = re.sub(r"<link[^>]*https://[^>]*>", "", page.read_text(encoding="utf-8"))
+    page.write_text(text.replace("<head>", "<head>" + _GUARD, 1), encoding="utf-8")
 
 
 def _asked(port: int, name: str) -> bytes:
     end, direct = time.monotonic() + _PATIENCE, build_opener(ProxyHandler({}))
     while True:
         try:
-            with direct.open(f"http://{LOOPBACK}:{port}{name}", timeout=_PATIENCE) as answer:
+            with direct.open(f"http://{LOOPBACK}:{port}/{name}", timeout=_PATIENCE) as answer:
                 return bytes(answer.read())
         except (URLError, OSError) as err:
             if time.monotonic() > end:
@@ -136,59 +136,55 @@ def _asked(port: int, name: str) -> bytes:
             time.sleep(0.1)
 
 
-class _Page(BaseHTTPRequestHandler):
-    """Hands out the page's files and the data, to this machine and under its own name only."""
+class _Page(SimpleHTTPRequestHandler):
+    """Hands out the files of a folder, to this machine and under its own name only."""
 
-    def __init__(self, files: Mapping[str, bytes], rrd: Path, *args: object) -> None:
-        self.files, self.rrd = files, rrd
-        super().__init__(*args)  # type: ignore[arg-type]
+    def send_head(self) -> Any:
+        """Answer with the page of the data; refuse who comes by another name: somebody else's page asks."""
+        host = self.headers.get("Host", "")
+        if host.rpartition(":")[0] not in {LOOPBACK, "localhost"}:
+            return self.send_error(403)
+        if self.path != "/":
+            return super().send_head()
+        self.send_response(303)
+        data = f"/?url=http://{host}/{_DATA}&hide_welcome_screen&notebook=0&persist=0"
+        self.send_header("Location", data)
+        self.send_header("Content-Length", "0")
+        return self.end_headers()
 
-    def do_GET(self) -> None:
-        """Answer."""
-        if self.headers.get("Host", "").rpartition(":")[0] not in {LOOPBACK, "localhost"}:
-            self.send_error(403)  # another name that leads here: somebody else's page asks
-            return
-        path, _, query = self.path.partition("?")
-        if path == "/" and not query:
-            data = f"http://{self.headers['Host']}{_DATA}"
-            self._answer(303, b"", {"Location": f"/?url={data}&hide_welcome_screen&notebook=0&persist=0"})
-        elif path == _DATA:
-            self._answer(200, self.rrd.read_bytes(), {"Content-Type": "application/octet-stream"})
-        elif (name := "/index.html" if path == "/" else path) in self.files:
-            self._answer(200, self.files[name], {"Content-Type": _TYPES[Path(name).suffix]})
-        else:
-            self.send_error(404)
-
-    def _answer(self, code: int, body: bytes, headers: Mapping[str, str]) -> None:
-        self.send_response(code)
-        always = {"Content-Length": str(len(body)), "Content-Security-Policy": _POLICY}
-        for name, value in {**headers, **always}.items():
-            self.send_header(name, value)
-        self.end_headers()
-        self.wfile.write(body)
+    def end_headers(self) -> None:
+        """Let the browser ask nobody else."""
+        self.send_header("Content-Security-Policy", _POLICY)
+        super().end_headers()
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the name of the base class
         """Say nothing of every request."""
 
 
-def make_server(rrd: Path, port: int = PORT) -> ThreadingHTTPServer:
-    """Server of the page of a file on the loopback interface; another port is taken where the wanted one is not free.
+@contextmanager
+def page_server(rrd: Path, port: int = PORT) -> Iterator[ThreadingHTTPServer]:
+    """Give a server of the page of a file on the loopback interface; another port is taken where the wanted one is not free.
 
     Raises
     ------
     ConfigError
         Rerun is not installed.
     """
-    handler = partial(_Page, page_files(), rrd)
-    try:
-        return ThreadingHTTPServer((LOOPBACK, port), handler)
-    except OSError:
-        return ThreadingHTTPServer((LOOPBACK, 0), handler)
+    with tempfile.TemporaryDirectory(prefix="tofcapture-view-") as folder:
+        save_page(Path(folder))
+        (Path(folder) / _DATA).symlink_to(rrd.resolve())
+        handler = partial(_Page, directory=folder)
+        try:
+            server = ThreadingHTTPServer((LOOPBACK, port), handler)
+        except OSError:
+            server = ThreadingHTTPServer((LOOPBACK, 0), handler)
+        with server:
+            yield server
 
 
 def show_page(rrd: Path) -> None:
     """Serve the page of a file until Ctrl-C, and say where."""
-    with make_server(rrd) as server:
+    with page_server(rrd) as server:
         where = f"http://{LOOPBACK}:{server.server_port}"
         print(f"open {where} in a browser of this machine; Ctrl-C ends", file=sys.stderr, flush=True)
         server.serve_forever()

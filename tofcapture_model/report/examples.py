@@ -12,12 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tofcapture.camera import Camera
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import Manifest
 from tofcapture.files.shard import GroundTruth, ShardReader
-from tofcapture.poses import Float64
-from tofcapture.viz.figures.scenes import Maps
+from tofcapture.viz.figures.scenes import Maps, Row
 from tofcapture_model.data import batched, make_frame
 from tofcapture_model.networks import Model
 from tofcapture_model.networks.baselines import sensor_estimate
@@ -27,45 +25,16 @@ FRAME = 0  # of the burst; evaluate takes the same one
 
 
 @dataclass(frozen=True)
-class Example:
-    """One view as the page shows it.
+class Example(Row):
+    """One view as the page shows it: a frame's amplitude at the lowest frequency, answers of ``sensor`` and ``model`` at 2x.
 
-    Attributes
-    ----------
-    name
-        Of the scene, with the number of the view in its recording.
-    camera
-        Intrinsics of the (2H, 2W) grid.
-    amplitude
-        (H, W) raw units, lowest modulation frequency, one frame.
-    confidence
-        (H, W) raw units, highest modulation frequency, mean of the burst.
-    tof_depth
-        (H, W) metres, one frame; NaN: none.
-    truth
-        At 2x.
-    answers
-        At 2x: of the ``sensor`` and, with weights, of the ``model``.
-    expected_error
-        (2H, 2W) metres, where the model tells how wrong it expects its depth to be.
-    T_base_tof
-        (4, 4).
+    ``confidence`` (H, W) is the burst's amplitude at the highest frequency, ``tof_depth`` (H, W) the frame's depth in metres,
+    NaN: none, ``expected_error`` (2H, 2W) metres, where the model tells how wrong it expects its depth to be.
     """
 
-    name: str
-    camera: Camera
-    amplitude: Float32
     confidence: Float32
     tof_depth: Float32
-    truth: GroundTruth
-    answers: dict[str, Maps]
     expected_error: Float32 | None
-    T_base_tof: Float64
-
-    @property
-    def good(self) -> NDArray[np.bool_]:
-        """(2H, 2W) where metrics are taken."""
-        return self.answers["sensor"].good
 
     @property
     def surface(self) -> NDArray[np.bool_]:
@@ -125,12 +94,12 @@ def _example(shard: ShardReader, view: int, model: Model | None) -> Example:
     low_i, low_q = (info.saturation * frame.phasor[0, i].numpy() for i in (0, 1))
     return Example(
         name=f"{shard.scene}, view {shard.index(view)}",
-        camera=shard.camera.scaled(2),
+        camera=shard.camera,
         amplitude=np.hypot(low_i, low_q),
         confidence=shard.tof(view).confidence,
         tof_depth=np.where(frame.valid[0, 0].numpy() > 0, frame.depth[0, 0].numpy(), np.nan),
         truth=truth,
-        answers=answers,
+        methods=answers,
         expected_error=expected,
         T_base_tof=shard.T_base_tof(view),
     )

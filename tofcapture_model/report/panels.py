@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from tofcapture.colours import NORMAL_WORDS, Scale, percentile, scale_for
 from tofcapture.poses import Float64
 from tofcapture.viz.figures.clouds import eye_for, splat
-from tofcapture.viz.figures.scenes import halved, object_window
 from tofcapture.viz.page import Picture, map_picture, mask_legend, mask_picture, normal_picture, picture
 from tofcapture_model.report.examples import Example
 
@@ -42,7 +41,7 @@ class Panel:
 
 def panels(examples: Sequence[Example]) -> list[Panel]:
     """Draw all examples; errors of all of them are on one scale."""
-    error = scale_for("error", [e.answers["sensor"].error_mm for e in examples])
+    error = scale_for("error", [e.methods["sensor"].error_mm for e in examples])
     return [
         Panel(
             e.name,
@@ -59,43 +58,40 @@ def _seen(e: Example) -> Group:
     pictures = [
         map_picture("amplitude, one frame", e.amplitude, amplitude, "amplitude image of the ToF camera"),
         map_picture("confidence, burst", e.confidence, confidence, "confidence map of the ToF camera"),
-        mask_picture(title, e.truth.mask, "mask of the ground truth", note, object_window(e.good)),
+        mask_picture(title, e.truth.mask, "mask of the ground truth", note, e.window),
     ]
     scales = [("amplitude, lowest frequency", amplitude), ("confidence, highest frequency", confidence)]
     return Group("What the ToF camera saw, and where ground truth is sound", "", pictures, scales)
 
 
 def _depths(e: Example) -> Group:
-    window = object_window(e.good)
     scale = scale_for("depth", [1e3 * e.truth.depth], [e.good], "mm")
     pictures = [
-        map_picture(
-            "ToF depth, one frame", 1e3 * e.tof_depth[halved(window)], scale, "depth of the ToF sensor"
-        )
+        map_picture("ToF depth, one frame", e.shown(1e3 * e.tof_depth), scale, "depth of the ToF sensor")
     ]
-    if "model" in e.answers:
-        depth = 1e3 * e.answers["model"].depth[window]
+    if "model" in e.methods:
+        depth = e.shown(1e3 * e.methods["model"].depth)
         pictures.append(map_picture("depth, network, same frame", depth, scale, "depth of the network"))
-    truth = 1e3 * e.truth.depth[window]
+    truth = e.shown(1e3 * e.truth.depth)
     pictures.append(map_picture("depth, ground truth", truth, scale, "depth of the ground truth"))
     return Group("Depth", "Grey: no value.", pictures, [("depth", scale)])
 
 
 def _errors(e: Example, scale: Scale) -> Group:
-    window, pictures, scales = object_window(e.good), [], [("answer minus ground truth", scale)]
-    for name, maps in e.answers.items():
+    pictures, scales = [], [("answer minus ground truth", scale)]
+    for name, maps in e.methods.items():
         method = METHOD_TITLES[name]
-        shown = np.where(e.surface, maps.error_everywhere_mm, np.nan)[window]
+        shown = e.shown(maps.error_where(e.surface))
         note = _mean("MAE {:.1f} mm on the object", np.abs(maps.error_mm))
         pictures.append(
             map_picture(f"error, {method}", shown, scale, f"signed depth error of the {method}", note)
         )
     if e.expected_error is not None:
         values = 1e3 * e.expected_error
-        expected = scale_for("expected", [values[window]])
+        expected = scale_for("expected", [e.shown(values)])
         note = _mean("mean {:.1f} mm on the object", values[e.good])
         title = "error that the network expects"
-        pictures.append(map_picture(title, values[window], expected, "expected error", note))
+        pictures.append(map_picture(title, e.shown(values), expected, "expected error", note))
         scales.append(("expected absolute error", expected))
     words = "Red: too far, blue: too near, grey: no sound ground truth."
     return Group("Depth error", words, pictures, scales)
@@ -107,20 +103,21 @@ def _mean(form: str, values: NDArray[np.floating]) -> str:
 
 
 def _normals(e: Example) -> Group:
-    window, pictures = object_window(e.good), []
-    for name, maps in e.answers.items():
+    pictures: list[Picture] = []
+    for name, maps in e.methods.items():
         note = _mean("mean angle {:.1f} degrees on the object", maps.angle_deg)
         method = METHOD_TITLES[name]
         title, alt = f"normals, {method}", f"normals of the {method}"
-        pictures.append(normal_picture(title, maps.normals[window], alt, note))
-    truth = e.truth.normals[window]
+        pictures.append(normal_picture(title, e.shown(maps.normals), alt, note))
+    truth = e.shown(e.truth.normals)
     pictures.append(normal_picture("normals, ground truth", truth, "normals of the ground truth"))
     return Group("Normals", f"{NORMAL_WORDS.capitalize()}.", pictures, [])
 
 
 def _clouds(e: Example, scale: Scale) -> Group:
     """Draw sensor, network and ground truth from the side: the object and what is near it."""
-    title, truth = "Points from the side", e.camera.unproject(e.truth.depth)
+    title, fine = "Points from the side", e.camera.scaled(2)
+    truth = fine.unproject(e.truth.depth)
     if not e.good.any():
         return Group(title, "No good pixel in this view.", [], [])
     centre = np.median(truth[e.good], axis=0)
@@ -128,14 +125,14 @@ def _clouds(e: Example, scale: Scale) -> Group:
     drawn: list[tuple[str, Float64, NDArray[Any]]] = [
         (
             METHOD_TITLES[name],
-            e.camera.unproject(maps.depth),
-            np.where(e.surface, maps.error_everywhere_mm, np.nan),
+            fine.unproject(maps.depth),
+            maps.error_where(e.surface),
         )
-        for name, maps in e.answers.items()
+        for name, maps in e.methods.items()
     ]
     drawn.append(("ground truth", truth, np.zeros(e.truth.depth.shape)))
     eye = eye_for(truth[_near(truth, centre, radius)], e.T_base_tof, e.camera.width / e.camera.height)
-    spacing = float(centre[2]) / e.camera.fx / float(eye.high[0] - eye.low[0]) * _WIDTH
+    spacing = float(centre[2]) / fine.fx / float(eye.high[0] - eye.low[0]) * _WIDTH
     size = int(np.clip(np.ceil(1.4 * spacing) + 1, 2, 7))
     pictures = []
     for name, points, error in drawn:

@@ -19,19 +19,7 @@ from tofcapture_model.training import read_metrics
 
 @dataclass(frozen=True)
 class Network:
-    """A loaded network and what its checkpoint says.
-
-    Attributes
-    ----------
-    model, config, provenance
-        From :func:`tofcapture_model.networks.checkpoint.load_model`.
-    name, sha256
-        Of the file.
-    rows
-        Lines of ``metrics.jsonl``; empty where there is none.
-    bundled
-        Whether it came with the installation.
-    """
+    """A loaded network, what its checkpoint says, name and digest of the file, and the lines of ``metrics.jsonl`` beside it."""
 
     model: Model
     config: Config
@@ -44,20 +32,9 @@ class Network:
 
 @dataclass(frozen=True)
 class Sources:
-    """What the page is made from; a part that is None is reported as absent for the reason given.
+    """What the page is made from: folder and manifest of the dataset, parsed JSON, the network.
 
-    Attributes
-    ----------
-    dataset
-        Folder, or None.
-    manifest, manifest_sha256
-        Of the dataset.
-    results, evidence
-        Parsed JSON.
-    network
-        With its weights.
-    absent
-        Reason by part: ``dataset``, ``results``, ``evidence``, ``weights``.
+    A part that is None is reported as absent for the reason in ``absent``: ``dataset``, ``results``, ``evidence``, ``weights``.
     """
 
     dataset: Path | None

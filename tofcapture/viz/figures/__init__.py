@@ -16,20 +16,10 @@ from tofcapture.viz.charts import METADATA, canvas, save
 
 @dataclass(frozen=True)
 class Choice:
-    """What of a path is drawn.
+    """What of a path is drawn: scene and view (``None``: the first, or as many scenes as there may be rows).
 
-    Attributes
-    ----------
-    scene
-        Name; ``None``: the first one, or as many as there are rows.
-    view
-        In a recording the number in the view's file name; in a shard the number in the shard. ``None``: the first.
-    rows
-        Largest number of scenes.
-    prediction
-        Folder that ``predict`` wrote, or one of such folders, named by scene.
-    rig
-        ``rig.toml`` to use instead of the recording's.
+    ``view`` is the number in the file's name or in the shard, ``prediction`` a folder that ``predict`` wrote or one of such
+    folders named by scene, ``rig`` a ``rig.toml`` to use instead of the recording's.
     """
 
     scene: str | None = None

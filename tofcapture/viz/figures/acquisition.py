@@ -30,20 +30,7 @@ _OTHER = {"lw": 0.7, "alpha": 0.7, "zorder": 2}
 
 
 def draw_acquisition(figure: Any, path: Path, scene: str | None, view: int | None) -> str:
-    """Draw a recording's way around a scene.
-
-    Parameters
-    ----------
-    figure
-        Of matplotlib.
-    path
-        Recording.
-    scene, view
-        Which; ``None``: the first that is no board, and its first view.
-
-    Returns
-    -------
-    What is on it, in words.
+    """Draw a recording's way around a scene (the first that is no board); returns what is on it, in words.
 
     Raises
     ------

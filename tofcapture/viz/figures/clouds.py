@@ -24,15 +24,7 @@ _MARGIN = 0.06  # of the extent
 
 @dataclass(frozen=True)
 class Eye:
-    """From where clouds are seen, orthographically.
-
-    Attributes
-    ----------
-    T_eye_tof
-        (4, 4) ToF frame to the eye's: x right, y down, z away.
-    low, high
-        (2,) x and y in the eye's frame at the picture's top left and bottom right corners, metres.
-    """
+    """From where clouds are seen, orthographically: x right, y down, z away; corners (2,) of the picture, metres."""
 
     T_eye_tof: Float64
     low: Float64
@@ -46,16 +38,9 @@ class Eye:
 
 
 def eye_for(points: Float64, T_base_tof: Float64, aspect: float = 4 / 3) -> Eye:
-    """Look at a cloud from the camera's left and from above, the table level.
+    """Look at points (N, 3) of the ToF frame from the camera's left and from above, the table level.
 
-    Parameters
-    ----------
-    points
-        (N, 3) what must be in the picture, but for 0.5 percent at each side; ToF frame, metres.
-    T_base_tof
-        (4, 4); z of the base is up.
-    aspect
-        Width over height of the picture.
+    All but 0.5 percent at each side are in the picture, whose width over height is ``aspect``.
     """
     axis = T_base_tof[:3, 2]
     heading = np.arctan2(axis[1], axis[0]) + _AZIMUTH

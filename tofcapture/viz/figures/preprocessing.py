@@ -29,18 +29,10 @@ _TOF, _STEREO, _NOISE = (SENSOR, "ToF"), (GROUND_TRUTH, "stereo"), (REMOVED, "no
 
 @dataclass(frozen=True)
 class Steps:
-    """Clouds (N, 3) of one view in the ToF frame, metres.
+    """Clouds (N, 3) of one view in the ToF frame, metres, and how far apart sensor and stereo are.
 
-    Attributes
-    ----------
-    tof
-        Everything that the sensor decoded.
-    captured, aligned
-        Stereo with the rig that the view was taken with, and with the calibrated one.
-    kept, removed
-        What the crop keeps of the object, and what of that denoising takes out.
-    before, after
-        Median of the distance in depth between both clouds at the sensor's pixels, metres.
+    Stereo is placed by the view's own rig and by the calibrated one; of the object, denoising keeps some points and
+    removes others. ``before`` and ``after`` are medians of the distance in depth at the sensor's pixels, metres.
     """
 
     tof: Float64
@@ -53,22 +45,9 @@ class Steps:
 
 
 def draw_preprocessing(figure: Any, path: Path, scene: str | None, view: int | None, rig: Path | None) -> str:
-    """Draw the steps of one view.
+    """Draw the steps of a view file, or of a recording's view; returns what is on it, in words.
 
-    Parameters
-    ----------
-    figure
-        Of matplotlib.
-    path
-        View file, or a recording.
-    scene, view
-        Which of a recording's; ``None``: the first.
-    rig
-        ``rig.toml``; ``None``: the one of the recording that the view lies in.
-
-    Returns
-    -------
-    What is on it, in words.
+    Without a ``rig`` that of the recording is used.
 
     Raises
     ------
@@ -92,14 +71,7 @@ def draw_preprocessing(figure: Any, path: Path, scene: str | None, view: int | N
 
 
 def preprocess(view: View, rig: Rig) -> Steps:
-    """Align, crop and denoise a view with the stages of the dataset.
-
-    Parameters
-    ----------
-    view
-        As it was captured.
-    rig
-        Calibrated constants.
+    """Align, crop and denoise a view with a calibrated rig and the stages of the dataset.
 
     Raises
     ------
@@ -138,17 +110,7 @@ def _moved(points: NDArray[Any], T_tof_stereo: Float64) -> Float64:
 
 
 def gap(stereo: Float64, depth: NDArray[np.floating], rig: Rig) -> float:
-    """Median of |ToF - stereo| over the sensor's pixels, metres; NaN where no pixel has both.
-
-    Parameters
-    ----------
-    stereo
-        (N, 3) points in the ToF frame.
-    depth
-        (H, W) of the sensor.
-    rig
-        Whose ToF camera it is.
-    """
+    """Median of |ToF - stereo| in depth, metres, of points (N, 3) in the ToF frame and depth (H, W); NaN without a common pixel."""
     pixels, z = rig.tof.project(stereo)
     at = np.rint(np.nan_to_num(pixels, nan=-1.0)).astype(np.intp)
     height, width = depth.shape

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.colours import ESTIMATE, GROUND_TRUTH, SENSOR, Scale, paint_normals, scale_for
+from tofcapture.colours import ESTIMATE, GROUND_TRUTH, SENSOR, Scale, UInt8, paint_normals, scale_for
 from tofcapture.errors import DataError, UsageError
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.shard import GroundTruth, ShardReader
@@ -42,12 +42,11 @@ class Maps:
     @property
     def error_mm(self) -> Float64:
         """(H, W) depth minus ground truth where that is good, millimetres."""
-        return np.where(self.good, self.error_everywhere_mm, np.nan)
+        return self.error_where(self.good)
 
-    @property
-    def error_everywhere_mm(self) -> Float64:
-        """(H, W) depth minus ground truth, millimetres."""
-        return 1e3 * (self.depth.astype(np.float64) - self.truth.depth)
+    def error_where(self, where: NDArray[np.bool_]) -> Float64:
+        """(H, W) depth minus ground truth, millimetres; NaN elsewhere."""
+        return np.where(where, 1e3 * (self.depth.astype(np.float64) - self.truth.depth), np.nan)
 
     @property
     def angle_deg(self) -> Float64:
@@ -60,43 +59,35 @@ class Maps:
 
 @dataclass(frozen=True)
 class Row:
-    """One scene.
-
-    Attributes
-    ----------
-    name
-        Scene and number of the view.
-    camera
-        ToF camera; maps may have twice its resolution.
-    T_base_tof
-        (4, 4).
-    amplitude
-        (H, W) raw units.
-    sensor
-        At the camera's resolution.
-    prediction
-        At twice the camera's; ``None``: not given.
-    truth
-        At twice the camera's.
-    """
+    """One view: amplitude (H, W) in raw units, maps by method at the camera's size or twice it, truth at twice it."""
 
     name: str
     camera: Camera
     T_base_tof: Float64
     amplitude: Float32
-    sensor: Maps
-    prediction: Maps | None
+    methods: dict[str, Maps]
     truth: GroundTruth
 
     @property
-    def methods(self) -> dict[str, Maps]:
-        """Sensor, and the prediction where there is one."""
-        return {"sensor": self.sensor} | ({} if self.prediction is None else {"prediction": self.prediction})
+    def good(self) -> NDArray[np.bool_]:
+        """(2H, 2W) where ground truth is good: the object."""
+        out: NDArray[np.bool_] = self.truth.mask == 0
+        return out
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the (2H, 2W) grid about the object."""
+        return object_window(self.good)
 
     def shown(self, image: NDArray[Any]) -> NDArray[Any]:
         """Cut an image at either resolution to the window about the object."""
-        window = object_window(self.truth.mask == 0)
-        return image[window if len(image) > self.camera.height else halved(window)]
+        if len(image) == len(self.good):
+            return image[self.window]
+        return image[tuple(slice(s.start // 2, (s.stop + 1) // 2) for s in self.window)]
+
+    def cell(self, values: NDArray[Any], scale: Scale, note: str = "") -> Cell:
+        """Paint what is shown of a map."""
+        return Cell(scale.paint(self.shown(values)), scale, note)
 
 
 def object_window(on_object: NDArray[np.bool_]) -> tuple[slice, slice]:
@@ -116,27 +107,8 @@ def object_window(on_object: NDArray[np.bool_]) -> tuple[slice, slice]:
     return span(float(ends[0].mean()), height), span(float(ends[1].mean()), width)
 
 
-def halved(window: tuple[slice, slice]) -> tuple[slice, slice]:
-    """Return the same window on the sensor's own grid."""
-    rows, columns = (slice(s.start // 2, (s.stop + 1) // 2) for s in window)
-    return rows, columns
-
-
 def read_rows(path: Path, scene: str | None, view: int, most: int, prediction: Path | None) -> list[Row]:
-    """Read one view of each scene.
-
-    Parameters
-    ----------
-    path
-        Dataset or shard.
-    scene
-        Only this one; ``None``: as many as there may be, spread evenly.
-    view
-        Number in the shard.
-    most
-        Largest number of rows.
-    prediction
-        Folder of ``predict``, or of such folders by name; ``None``: none.
+    """Read one view of each scene of a dataset, or of a shard; without a ``scene`` at most so many, spread evenly.
 
     Raises
     ------
@@ -180,10 +152,11 @@ def _row(path: Path, view: int, prediction: Path | None) -> Row:
         if not 0 <= view < shard.views:
             raise DataError(f"{path}: expected a view of 0 to {shard.views - 1}, got {view}", hint="--view 0")
         tof, truth, fine = shard.tof(view), shard.ground_truth(view, 1), shard.ground_truth(view, 2)
-        given = None if prediction is None else _predicted(prediction, shard.scene, view, fine)
-        sensor = Maps(tof.depth, shard.tof_normals(view), truth)
+        methods = {"sensor": Maps(tof.depth, shard.tof_normals(view), truth)}
+        if prediction is not None:
+            methods["prediction"] = _predicted(prediction, shard.scene, view, fine)
         name = f"{shard.scene} {shard.index(view)}"
-        return Row(name, shard.camera, shard.T_base_tof(view), tof.confidence, sensor, given, fine)
+        return Row(name, shard.camera, shard.T_base_tof(view), tof.confidence, methods, fine)
 
 
 def _predicted(folder: Path, scene: str, view: int, truth: GroundTruth) -> Maps:
@@ -205,100 +178,67 @@ def _predicted(folder: Path, scene: str, view: int, truth: GroundTruth) -> Maps:
 
 
 def draw_rows(figure: Any, kind: str, rows: Sequence[Row]) -> str:
-    """Draw rows of ``depth`` or ``normals``; returns what is on it, in words.
-
-    Parameters
-    ----------
-    figure
-        Of matplotlib.
-    kind
-        Which.
-    rows
-        All with a prediction or all without.
-    """
-    images, bare = [row.amplitude for row in rows], [""] * len(rows)
-    amplitude = _scaled("amplitude", rows, images, [scale_for("amplitude", images)] * len(rows), bare)
+    """Draw rows of ``depth`` or ``normals``, all with a prediction or all without; returns what is on it, in words."""
+    amplitude = scale_for("amplitude", [row.amplitude for row in rows])
+    first = Column("amplitude", [row.cell(row.amplitude, amplitude) for row in rows])
     columns, error = (_depth_columns if kind == "depth" else _normal_columns)(rows)
     title = f"{'Depth' if kind == 'depth' else 'Normals'} against ground truth"
     aspect = rows[0].camera.width / rows[0].camera.height
-    draw_table(figure, title, [row.name for row in rows], [amplitude, *columns], aspect)
-    sign = "±" if kind == "depth" else "0 to "
-    return (
-        f"{len(rows)} scene{'s' if len(rows) > 1 else ''}, scale of errors {sign}{error.high:g} {error.unit}"
-    )
+    draw_table(figure, title, [row.name for row in rows], [first, *columns], aspect)
+    sign, several = "±" if kind == "depth" else "0 to ", "s" if len(rows) > 1 else ""
+    return f"{len(rows)} scene{several}, scale of errors {sign}{error.high:g} {error.unit}"
 
 
 def _depth_columns(rows: Sequence[Row]) -> tuple[list[Column], Scale]:
-    depths = [_depth_scale(row) for row in rows]
-    notes = [scale.words for scale in depths]
+    scaled = [(row, _depth_scale(row)) for row in rows]
     error = scale_for("error", [maps.error_mm for row in rows for maps in row.methods.values()])
-    columns = [
-        _scaled(f"{name} depth", rows, [row.methods[name].depth for row in rows], depths, notes, DEPTH_KEY)
-        for name in rows[0].methods
-    ]
-    columns.append(_scaled("ground truth", rows, [row.truth.depth for row in rows], depths, notes))
+    columns, errors = [], []
     for name in rows[0].methods:
-        errors = [row.methods[name].error_mm for row in rows]
-        notes = [_note("mean |e| {:.2f} mm", np.abs(e)) for e in errors]
-        columns.append(_scaled(f"{name} error", rows, errors, [error] * len(rows), notes))
+        cells = [row.cell(row.methods[name].depth, depth, depth.words) for row, depth in scaled]
+        columns.append(Column(f"{name} depth", cells, DEPTH_KEY))
+        mm = [(row, row.methods[name].error_mm) for row in rows]
+        cells = [row.cell(e, error, _note("mean |e| {:.2f} mm", np.abs(e))) for row, e in mm]
+        errors.append(Column(f"{name} error", cells))
+    columns.append(Column("ground truth", [row.cell(row.truth.depth, d, d.words) for row, d in scaled]))
     name, colour = _best(rows[0])
     key = ((colour, name), (GROUND_TRUTH, "ground truth"))
-    return [*columns, Column("from the side", [Cell(_cloud(row)) for row in rows], key)], error
+    return [*columns, *errors, Column("from the side", [Cell(_cloud(row)) for row in rows], key)], error
 
 
 def _depth_scale(row: Row) -> Scale:
     """Scale that shows the object of one row."""
-    maps = [(m.depth, m.good) for m in row.methods.values()] + [(row.truth.depth, row.truth.mask == 0)]
+    maps = [(m.depth, m.good) for m in row.methods.values()] + [(row.truth.depth, row.good)]
     return scale_for("depth", [depth for depth, _ in maps], [good for _, good in maps])
 
 
 def _normal_columns(rows: Sequence[Row]) -> tuple[list[Column], Scale]:
     angle = scale_for("angle", [maps.angle_deg for row in rows for maps in row.methods.values()])
-    columns = [
-        _painted(f"{name} normals", rows, [row.methods[name].normals for row in rows], NORMAL_KEY)
-        for name in rows[0].methods
-    ]
-    columns.append(_painted("ground truth", rows, [row.truth.normals for row in rows]))
+    columns, errors = [], []
     for name in rows[0].methods:
-        angles = [row.methods[name].angle_deg for row in rows]
-        notes = [_note("mean {:.1f}\N{DEGREE SIGN}", a) for a in angles]
-        columns.append(_scaled(f"{name} error", rows, angles, [angle] * len(rows), notes))
-    return columns, angle
+        cells = [Cell(paint_normals(row.shown(row.methods[name].normals))) for row in rows]
+        columns.append(Column(f"{name} normals", cells, NORMAL_KEY))
+        degrees = [(row, row.methods[name].angle_deg) for row in rows]
+        cells = [row.cell(a, angle, _note("mean {:.1f}\N{DEGREE SIGN}", a)) for row, a in degrees]
+        errors.append(Column(f"{name} error", cells))
+    columns.append(
+        Column("ground truth", [Cell(paint_normals(row.shown(row.truth.normals))) for row in rows])
+    )
+    return [*columns, *errors], angle
 
 
 def _note(form: str, values: Float64) -> str:
     return form.format(np.nanmean(values)) if np.isfinite(values).any() else ""
 
 
-def _scaled(
-    title: str,
-    rows: Sequence[Row],
-    maps: Sequence[NDArray[Any]],
-    scales: Sequence[Scale],
-    notes: Sequence[str],
-    key: Any = (),
-) -> Column:
-    cells = [
-        Cell(scale.paint(row.shown(values)), scale, note)
-        for row, values, scale, note in zip(rows, maps, scales, notes, strict=True)
-    ]
-    return Column(title, cells, key)
-
-
-def _painted(title: str, rows: Sequence[Row], normals: Sequence[Float32], key: Any = ()) -> Column:
-    cells = [Cell(paint_normals(row.shown(n))) for row, n in zip(rows, normals, strict=True)]
-    return Column(title, cells, key)
-
-
 def _best(row: Row) -> tuple[str, tuple[int, int, int]]:
-    return ("sensor", SENSOR) if row.prediction is None else ("prediction", ESTIMATE)
+    return ("prediction", ESTIMATE) if "prediction" in row.methods else ("sensor", SENSOR)
 
 
-def _cloud(row: Row) -> NDArray[np.uint8]:
+def _cloud(row: Row) -> UInt8:
     """Draw the object alone, of the best that is known of it, over its ground truth."""
     name, colour = _best(row)
     maps, fine = row.methods[name], row.camera.scaled(2)
-    exact = fine.unproject(row.truth.depth)[row.truth.mask == 0]
-    found = (row.camera if row.prediction is None else fine).unproject(maps.depth)[maps.good]
+    exact = fine.unproject(row.truth.depth)[row.good]
+    found = (fine if len(maps.depth) == fine.height else row.camera).unproject(maps.depth)[maps.good]
     aspect = row.camera.width / row.camera.height
     return splat([(exact, GROUND_TRUTH), (found, colour)], eye_for(exact, row.T_base_tof, aspect), 400, 3)
