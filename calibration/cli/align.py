@@ -72,10 +72,10 @@ def _page(
     recording: Path, old: OldRig | None, evidence: dict[str, Any], progress: Callable[[str, int, int], None]
 ) -> tuple[str | None, str]:
     """Write evidence.html; its path, or None and why there is none: rig and evidence stand without it."""
-    from calibration.evidence.page import write_page
+    from calibration.evidence.page import write_evidence_page
 
     try:
-        return str(write_page(recording, old, evidence, progress)), ""
+        return str(write_evidence_page(recording, old, evidence, progress)), ""
     except ConfigError as err:
         # An older page would speak of an older alignment.
         (recording / "evidence.html").unlink(missing_ok=True)

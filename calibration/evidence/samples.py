@@ -1,4 +1,4 @@
-"""Residuals of an alignment, point by point, computed anew from the views of a recording."""
+"""Compute the residuals of an alignment anew, point by point, from the views of a recording."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.alignment.rounds import RangeResidual
 from calibration.range_error.error import SIMPLE
@@ -20,6 +19,7 @@ from tofcapture.camera import Camera
 from tofcapture.frames import View
 from tofcapture.poses import Float64, check_transform, invert, transform
 
+Progress = Callable[[str, int, int], None]
 MOST_VIEWS = 24  # views that are read for the page, evenly; each costs a second
 MOST_POINTS = 6000  # surface points per view
 
@@ -32,24 +32,19 @@ class Samples:
     ----------
     camera
         ToF intrinsics.
-    view
-        (N,) int, index of the view of each surface point.
     pixel
-        (N, 2) float64, u and v of the point in the ToF image.
+        (N, 2) float64, u and v of each surface point in the ToF image.
     range, amplitude
         (N,) float64: metres along the ray; raw units at the highest modulation frequency.
     residual
         (N,) float64, metres, along the stereo surface's normal; positive where ToF measures too far.
     rims
         (M,) float64, metres, ToF rims across stereo rims, signed.
-    poses
-        One (4, 4) ``T_tof_board`` per view: centroid of the points, normal of their plane.
-    outlines
-        (K, 2) convex stand-in for the board about that pose, metres.
+    poses, outlines
+        Of the board in each view: (4, 4) ``T_tof_board`` (centroid, normal of the plane) and (32, 2) metres about it.
     """
 
     camera: Camera
-    view: NDArray[np.intp]
     pixel: Float64
     range: Float64
     amplitude: Float64
@@ -59,9 +54,7 @@ class Samples:
     outlines: list[Float64]
 
 
-def sample_recording(
-    recording: Path, evidence: Mapping[str, Any], progress: Callable[[str, int, int], None]
-) -> Samples:
+def sample_recording(recording: Path, evidence: Mapping[str, Any], progress: Progress) -> Samples:
     """Measure the residuals of a recording's views.
 
     Parameters
@@ -81,18 +74,20 @@ def sample_recording(
     from tofcapture.files.view import read_view
 
     T_stereo_tof = invert(check_transform(evidence["T_tof_stereo"], "evidence: T_tof_stereo"))
-    paths = _chosen(calibration_views(recording), evidence)
-    parts = []
-    for i, path in enumerate(paths):
-        progress("evidence page", i, len(paths))
-        parts.append(_sample(read_view(path), i, T_stereo_tof, evidence))
-    return _joined(parts)
-
-
-def _chosen(paths: list[Path], evidence: Mapping[str, Any]) -> list[Path]:
-    refused = {Path(p["view"]).name for p in evidence.get("pairs", ()) if not p.get("accepted", True)}
+    paths = calibration_views(recording)
+    refused = {Path(p["view"]).name for p in evidence["pairs"] if not p["accepted"]}
     good = [p for p in paths if p.name not in refused] or paths
-    return [good[i] for i in np.unique(np.linspace(0, len(good) - 1, MOST_VIEWS).round().astype(int))]
+    some = np.unique(np.linspace(0, len(good) - 1, MOST_VIEWS).round().astype(int))
+    parts = []
+    for i in some:
+        progress("evidence page", len(parts), len(some))
+        parts.append(_sample(read_view(good[i]), T_stereo_tof, evidence))
+    joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _ARRAYS}
+    poses, outlines = [T for p in parts for T in p.poses], [o for p in parts for o in p.outlines]
+    return Samples(camera=parts[0].camera, **joined, poses=poses, outlines=outlines)
+
+
+_ARRAYS = ("pixel", "range", "amplitude", "residual", "rims")
 
 
 def residual_from(evidence: Mapping[str, Any], camera: Camera) -> RangeResidual:
@@ -107,7 +102,7 @@ def residual_from(evidence: Mapping[str, Any], camera: Camera) -> RangeResidual:
     return RangeResidual(camera, float(table["modulation_hz"]), coefficients)
 
 
-def _sample(view: View, index: int, T_stereo_tof: Float64, evidence: Mapping[str, Any]) -> Samples:
+def _sample(view: View, T_stereo_tof: Float64, evidence: Mapping[str, Any]) -> Samples:
     camera = view.tof.info.camera
     phasor, depth = tof_depth(view.tof)
     raw = surface_points(view.tof, depth)
@@ -120,24 +115,21 @@ def _sample(view: View, index: int, T_stereo_tof: Float64, evidence: Mapping[str
     held = rim_cloud(stereo_rims(view.stereo.points), T_stereo_tof[:3, 3])
     rims = tof_rims(phasor, depth, camera).points
     across = residuals(rims, held, T_stereo_tof).distance if len(held) and len(rims) else np.zeros(0)
-    pose, outline = _stand_in(points)
+    boards = [_stand_in(points)] if len(points) > 3 else []
     return Samples(
         camera,
-        np.full(len(kept), index),
         pixel,
         np.linalg.norm(kept, axis=1),
         np.abs(phasor[-1])[row, column],
         -found.distance,
         across,
-        [pose] if len(points) > 3 else [],
-        [outline] if len(points) > 3 else [],
+        [pose for pose, _ in boards],
+        [outline for _, outline in boards],
     )
 
 
 def _stand_in(points: Float64) -> tuple[Float64, Float64]:
     """Pose and outline (32, 2) of a plane's points (N, 3): an ellipse that covers what they cover, normal towards the camera."""
-    if len(points) <= 3:
-        return np.eye(4), np.zeros((0, 2))
     centre = points.mean(axis=0)
     _, singular, axes = np.linalg.svd(points - centre, full_matrices=False)
     x, z = axes[0], axes[2] if axes[2] @ centre < 0 else -axes[2]
@@ -145,20 +137,3 @@ def _stand_in(points: Float64) -> tuple[Float64, Float64]:
     angle = 2 * np.pi * np.arange(32) / 32
     outline = half * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return transform(np.stack([x, np.cross(z, x), z], axis=1), centre), outline
-
-
-def _joined(parts: list[Samples]) -> Samples:
-    def all_of(name: str) -> Any:
-        return np.concatenate([getattr(p, name) for p in parts])
-
-    return Samples(
-        camera=parts[0].camera,
-        view=all_of("view"),
-        pixel=all_of("pixel"),
-        range=all_of("range"),
-        amplitude=all_of("amplitude"),
-        residual=all_of("residual"),
-        rims=all_of("rims"),
-        poses=[T for p in parts for T in p.poses],
-        outlines=[o for p in parts for o in p.outlines],
-    )
