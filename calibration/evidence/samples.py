@@ -78,7 +78,7 @@ def sample_recording(recording: Path, evidence: Mapping[str, Any], progress: Pro
     refused = {Path(p["view"]).name for p in evidence["pairs"] if not p["accepted"]}
     good = [p for p in paths if p.name not in refused] or paths
     some = np.unique(np.linspace(0, len(good) - 1, MOST_VIEWS).round().astype(int))
-    parts = []
+    parts: list[Samples] = []
     for i in some:
         progress("evidence page", len(parts), len(some))
         parts.append(_sample(read_view(good[i]), T_stereo_tof, evidence))
