@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -83,16 +82,9 @@ def _load(recording: Path, progress: Progress) -> list[Pair]:
     for i, path in enumerate(paths):
         progress("reading", i, len(paths))
         pairs.append(load_pair(recording, path))
-    check_cameras(pairs)
-    return pairs
-
-
-def check_cameras(pairs: Sequence[Pair]) -> None:
-    """Refuse pairs of different cameras (:class:`DataError`): one recording holds one rig."""
-    first = pairs[0].rig
-    for pair in pairs[1:]:
-        if (pair.rig.tof, pair.rig.stereo) != (first.tof, first.stereo):
+        if (pairs[-1].rig.tof, pairs[-1].rig.stereo) != (pairs[0].rig.tof, pairs[0].rig.stereo):
             raise DataError(
-                f"{pair.name}: taken with other cameras than {pairs[0].name}",
+                f"{pairs[-1].name}: taken with other cameras than {pairs[0].name}",
                 hint="use one recording per rig",
             )
+    return pairs

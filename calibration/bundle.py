@@ -94,17 +94,10 @@ def solve_bundle(
     The fits are of both cameras, in any order; a view may lack either. ``arm`` is (N, 4, 4) T_base_flange, ``arm_sigma`` the standard
     deviation of an arm pose per axis, metres and radians.
 
-    Raises
-    ------
-    DataError
-        Impossible poses.
-    QualityError
-        Fewer than five fits of a camera.
-    HandEyeRefused
-        Motion that determines nothing: pure translation, small rotations, a single axis; named by its ``cause``.
+    :class:`DataError` for impossible poses, :class:`QualityError` for fewer than five fits of a camera, and ``HandEyeRefused``, with
+    its ``cause``, for motion that determines nothing: pure translation, small rotations, a single axis.
     """
     A = clean(arm, "arm poses")
-    _check(fits)
     motion, X, Z = _start(A, fits)
     seen = _Observations(
         A,
@@ -131,21 +124,16 @@ def solve_bundle(
     return Bundle(X[0], X[1], Z, covariance, variance, seen.weight(r), seen.arm_error(E), motion)
 
 
-def _check(fits: Sequence[BoardFit]) -> None:
-    for camera in CAMERAS:
-        count = sum(f.camera == camera for f in fits)
-        if count < MIN_FITS:
-            raise QualityError(
-                f"bundle refused, too few board fits: expected at least {MIN_FITS} of the {camera} camera, got {count}",
-                hint="record more board views, tilted and rolled in all directions",
-            )
-
-
 def _start(A: Float64, fits: Sequence[BoardFit]) -> tuple[tuple[float, float, float], list[Float64], Float64]:
     """Closed form per camera behind the gate on motion; the board where most views put it."""
     found, places, motions = [], [], []
     for camera in CAMERAS:
         own = [f for f in fits if f.camera == camera]
+        if len(own) < MIN_FITS:
+            raise QualityError(
+                f"bundle refused, too few board fits: expected at least {MIN_FITS} of the {camera} camera, got {len(own)}",
+                hint="record more board views, tilted and rolled in all directions",
+            )
         P = np.stack([A[f.view] for f in own])
         B = clean(np.stack([f.T_camera_board for f in own]), f"board poses of the {camera} camera")
         motions.append(check_motion(P, B))

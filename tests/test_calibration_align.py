@@ -267,6 +267,7 @@ def test_numbers_of_evidence_are_those_of_the_registrations():
         None
     ] * 3
     assert found["range_residual"]["harmonics"] == [[1, 0, 0], [2, 0.001, -0.002], [4, 0, 0]]
+    assert found["range_residual"]["per_pixel_radius"] == 1e-5
     assert (found["range_residual"]["offset"], found["working_point_m"]) == (0.004, [0, 0, 0.8])
     assert found["truth"] == {"rotation_error_deg": 0.0, "translation_error_mm": 0.0}
     judged = {c["words"]: (c["value"], c["verdict"]) for c in found["checks"]}

@@ -284,7 +284,7 @@ def test_joint_evidence_holds_covariance_and_suggestion():
     """Evidence gains a (6, 6) covariance, eigenvalues and a next view, all JSON numbers."""
     rng = np.random.default_rng(6)
     found = joint_icp([made_view(i, rng, noise=5e-4) for i in range(4)], GUESS)
-    evidence = joint_evidence(found, composed((), HZ, found.range_coefficients))
+    evidence = joint_evidence(found, HZ)
     assert np.array(evidence["covariance"]).shape == (6, 6)
     assert len(evidence["observability"]["eigenvalues"]) == 6
     assert evidence["observability"]["unconstrained"] == []

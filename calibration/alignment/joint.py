@@ -95,7 +95,10 @@ def joint_icp(views: Sequence[JointView], T_tof_stereo: Float64) -> JointSolutio
             f"joint alignment: expected at least 3 views, got {len(views)}", hint="record more board views"
         )
     trees = [(cKDTree(v.surface.points), cKDTree(v.held.points)) for v in views]
-    now, finest = _start(views, T_tof_stereo), DISTANCES[-1]
+    F, finest = len(views[0].modulation_hz), DISTANCES[-1]
+    centre = np.concatenate([v.points(F - 1, np.zeros(len(v.rays))) for v in views]).mean(axis=0)
+    nothing = np.zeros(F * TERMS + len(HALO_RADII) + SIDES)
+    now = _Estimate(invert(T_tof_stereo), nothing, centre, _first_variances(F), RIM_SIGMA)
     for reach in (*DISTANCES, *[finest] * FINE_ROUNDS):
         free = slice(0, 6 if reach == DISTANCES[0] else -SIDES)
         equations = _linearised(views, trees, now, reach)
@@ -105,15 +108,6 @@ def joint_icp(views: Sequence[JointView], T_tof_stereo: Float64) -> JointSolutio
             )
         now = _step(equations, now, free, fine=reach == finest)
     return _solution(_linearised(views, trees, now, finest), now, _storable_range_errors(views, trees, now))
-
-
-def _start(views: Sequence[JointView], T_tof_stereo: Float64) -> _Estimate:
-    F = len(views[0].modulation_hz)
-    points = np.concatenate([v.points(F - 1, np.zeros(len(v.rays))) for v in views])
-    unknowns = F * TERMS + len(HALO_RADII) + SIDES
-    return _Estimate(
-        invert(T_tof_stereo), np.zeros(unknowns), points.mean(axis=0), _first_variances(F), RIM_SIGMA
-    )
 
 
 def _storable_range_errors(views: Sequence[JointView], trees: Sequence[Trees], now: _Estimate) -> Float64:

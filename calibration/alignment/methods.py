@@ -22,7 +22,7 @@ from calibration.registration.pairs import Pair
 from tofcapture.errors import ConfigError
 from tofcapture.files.view import read_view
 from tofcapture.poses import Float64, invert, rotation_angle, transform_points
-from tofcapture.rig import RangeError, Rig
+from tofcapture.rig import RangeError, Rig, range_error_table
 
 METHODS = ("averaged", "weighted", "joint")
 TRUTH_POINT = (0.0, 0.0, 0.8)  # m, ToF frame: the middle of the working volume, where errors are stated
@@ -60,9 +60,9 @@ def apply_method(
         views = [joint_view_of(read_view(recording / pairs[i].name)) for i in solution.used]
         joint = joint_icp(views, averaged)
         found["joint"] = joint.T_tof_stereo
-        errors = composed(views[0].factory, views[0].modulation_hz, joint.range_coefficients)
-        rig = replace(start, range_errors=errors)
-        extra = joint_evidence(joint, errors)
+        hz = views[0].modulation_hz
+        rig = replace(start, range_errors=composed(views[0].factory, hz, joint.range_coefficients))
+        extra = joint_evidence(joint, hz)
     methods = {name: _stated(T, pairs[0].truth) for name, T in found.items()}
     rig = replace(rig, T_tof_stereo=found[method])
     return rig, {"method": method, "methods": methods, **extra}
@@ -94,12 +94,11 @@ def composed(
     )
 
 
-def joint_evidence(joint: JointSolution, errors: Sequence[RangeError]) -> dict[str, Any]:
-    """State covariance, observability, suggestion and range errors of a joint solution as JSON types."""
+def joint_evidence(joint: JointSolution, modulation_hz: Sequence[float]) -> dict[str, Any]:
+    """State covariance, observability, suggestion and range errors (beyond the factory's) of a joint solution as JSON types."""
     # What is believed is the covariance; the model's own information knows nothing of bias.
     information = np.asarray(np.linalg.inv(joint.covariance), dtype=np.float64)
     values, _ = observability(information)
-    own = composed((), [e.modulation_hz for e in errors], joint.range_coefficients)
     return {
         "working_point_m": joint.centre.tolist(),
         **_uncertainty(joint.influence, joint.covariance),
@@ -109,16 +108,7 @@ def joint_evidence(joint: JointSolution, errors: Sequence[RangeError]) -> dict[s
             "unconstrained": unconstrained(information),
             "suggestion": suggest_view(information, joint.centre),
         },
-        "range_errors": [
-            {
-                "modulation_hz": x.modulation_hz,
-                "offset": x.offset,
-                "per_pixel_radius": x.per_pixel_radius,
-                "harmonics": [list(wave) for wave in x.harmonics],
-                "with_factory_offset": error.offset,
-            }
-            for x, error in zip(own, errors, strict=True)
-        ],
+        "range_errors": [range_error_table(e) for e in composed((), modulation_hz, joint.range_coefficients)],
     }
 
 
@@ -164,11 +154,8 @@ def suggest_view(information: Float64, working_point: Float64) -> dict[str, Any]
     Every candidate adds the information of a tilted plane at the working point. The best has the smallest largest eigenvalue of
     the covariance, and among equals the smallest trace.
 
-    Returns
-    -------
-    dict
-        ``tilt_deg``, ``towards_deg`` (direction in the image in which the board's normal leans, 0 right, 90 down),
-        ``motion`` that is weakest now, ``sigma_mm`` of it before and ``expected_sigma_mm`` after.
+    The answer holds ``tilt_deg``, ``towards_deg`` (direction in the image in which the board's normal leans, 0 right, 90 down),
+    ``motion`` that is weakest now, ``sigma_mm`` of it before and ``expected_sigma_mm`` after.
     """
 
     def after(tilt_deg: float, towards_deg: float) -> Float64:

@@ -112,9 +112,7 @@ def halo_errors(phasor: NDArray[np.complex128], modulation_hz: tuple[float, ...]
     A share k of the light falls back on the sensor as a broad halo: ``z' = z + k (z * h)``, ``h ~ (1 + (r/a)^2)^(-3/2)`` of unit
     sum. The range grows by ``c/(4 pi f) Im(conj(z) (z * h)) / |z|^2`` per unit of k, to first order.
 
-    Returns
-    -------
-    (F, H, W, len(HALO_RADII)) float64, metres.
+    The answer is (F, H, W, len(HALO_RADII)), metres.
     """
     from scipy.signal import fftconvolve
 

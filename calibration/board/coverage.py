@@ -28,12 +28,9 @@ def coverage(poses: Sequence[Float64], camera: Camera, outline: Float64) -> dict
     The poses (4, 4) are ``T_tof_board``: the board's origin and, along its z, the normal of its front. The outline is (M, 2), metres,
     or (N, M, 2), one for each view.
 
-    Returns
-    -------
-    dict
-        JSON types: ``views``; ``tilt_deg``, ``lean_deg`` and ``distance_m`` of each view; ``tilt_histogram`` (counts between
-        ``tilt_edges_deg``); ``sectors`` (counts by the direction in which the front leans in the image); ``image`` (9 x 12 counts),
-        ``image_share``; ``missing`` (what to record next, in words; empty when nothing is).
+    The answer is JSON: ``views``; ``tilt_deg``, ``lean_deg`` and ``distance_m`` of each view; ``tilt_histogram`` (counts between
+    ``tilt_edges_deg``); ``sectors`` (counts by the direction in which the front leans in the image); ``image`` (9 x 12 counts),
+    ``image_share``; ``missing`` (what to record next, in words; empty when nothing is).
     """
     tilts, leans, grid = [], [], np.zeros(CELLS, dtype=int)
     sectors = dict.fromkeys(SECTORS, 0)

@@ -115,10 +115,7 @@ def detect(sight: Sight, board: Board, camera: Camera) -> Detection:
 
     The sight's ranges may be wrong by a centimetre in common; the camera's intrinsics say what lies in the image.
 
-    Raises
-    ------
-    QualityError
-        Named by a :class:`BoardRefusal`: no plane, no holes visible, ambiguous, wrong board.
+    :class:`QualityError` where no pose is certain, named by a :class:`BoardRefusal`.
     """
     model = Model(board)
     thin = replace(sight, rims=sight.rims[:: max(1, len(sight.rims) // MOST_RIMS)])

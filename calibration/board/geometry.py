@@ -63,10 +63,7 @@ class Board:
 def load_board(board: str | Path = DEFAULT) -> Board:
     """Read a board: a TOML file, or a packaged one by name (``default``, ``second``).
 
-    Raises
-    ------
-    ConfigError
-        Missing, not TOML, or not a board; the message names the hole.
+    :class:`ConfigError` where it is missing, not TOML, or not a board; the message names the hole.
     """
     packaged = {p.stem: p for p in sorted(BOARDS.glob("*.toml"))}
     path = packaged.get(str(board), Path(board))
@@ -84,10 +81,8 @@ def load_board(board: str | Path = DEFAULT) -> Board:
 def board_from(table: Mapping[str, Any], where: str = "board") -> Board:
     """Read a board from plain TOML types and check it.
 
-    Raises
-    ------
-    ConfigError
-        Wrong format, units or keys; polygons that cross themselves or each other, leave the outline, leave too little material.
+    :class:`ConfigError` for wrong format, units or keys, and for polygons that cross themselves or each other, leave the outline, or
+    leave too little material.
     """
     _known(table, {"format", "version", "units", "name", "thickness", "outline", "hole"}, where)
     if table.get("format") != "tofcapture-board" or table.get("version") != 1:

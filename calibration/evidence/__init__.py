@@ -20,7 +20,7 @@ from calibration.registration.pairs import Pair
 from tofcapture.errors import DataError
 from tofcapture.files.seal import write_text
 from tofcapture.poses import Float64, invert, rotation_angle, transform_points
-from tofcapture.rig import RangeError
+from tofcapture.rig import RangeError, range_error_table
 
 FORMAT = "tofcapture-evidence"
 ASIDE = 0.1  # m from the working point at which the least certain motion is stated
@@ -40,7 +40,8 @@ def evidence_of(
     (4, 4) are the start and the result. What the method has ``found`` of itself, as its standard error, replaces the average's.
     """
     rows = [_pair(i, pair, solution) for i, pair in enumerate(pairs)]
-    true = pairs[0].truth
+    true, residual = pairs[0].truth, solution.residual
+    hz = residual.modulation_hz
     evidence = {
         "format": FORMAT,
         "version": 1,
@@ -52,7 +53,7 @@ def evidence_of(
         "spread": _degrees_mm(*solution.average.spread),
         "standard_error": _degrees_mm(*solution.average.standard_error),
         "working_point_m": solution.working_point.tolist(),
-        "range_residual": _range_residual(solution),
+        "range_residual": range_error_table(Terms(hz).added(RangeError(hz), residual.coefficients)),
         "pairs": rows,
         "truth": None if true is None else _degrees_mm(*alignment_error(T_tof_stereo, true), "_error"),
         "provenance": {
@@ -128,17 +129,6 @@ def _both(key: str, found: Mapping[str, float], suffix: str = "") -> list[Judged
         judged(f"{key}_rotation", found[f"rotation{suffix}_deg"]),
         judged(f"{key}_translation", found[f"translation{suffix}_mm"]),
     ]
-
-
-def _range_residual(solution: Solution) -> dict[str, Any]:
-    hz = solution.residual.modulation_hz
-    error = Terms(hz).added(RangeError(hz), solution.residual.coefficients)
-    return {
-        "modulation_hz": hz,
-        "offset": error.offset,
-        "per_pixel_radius": error.per_pixel_radius,
-        "harmonics": [list(wave) for wave in error.harmonics],
-    }
 
 
 def _pair(i: int, pair: Pair, solution: Solution) -> dict[str, Any]:

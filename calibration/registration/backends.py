@@ -40,15 +40,9 @@ def register(
     stays there where the clouds are empty. ``distances`` are correspondence distances, metres, descending, and the scale of a
     robust kernel.
 
-    Raises
-    ------
-    ConfigError
-        Unknown backend, or its library is not installed.
-
-    Notes
-    -----
-    Open3D and kiss-icp sum in parallel. They are bit-reproducible only in a process that was held to one core before it loaded
-    them: ``Pool(1, pinned=True)`` of :mod:`tofcapture.pool`.
+    :class:`ConfigError` for an unknown backend, or a library that is not installed. Open3D and kiss-icp sum in parallel: they are
+    bit-reproducible only in a process that was held to one core before it loaded them, ``Pool(1, pinned=True)`` of
+    :mod:`tofcapture.pool`.
     """
     method = backend_named(backend)
     empty = check_clouds(source, target) is not None

@@ -56,16 +56,8 @@ def plane_departure(depth: NDArray[np.floating]) -> Float64:
     """Measure how far each pixel lies off the line through its two neighbours, the larger of both image axes.
 
     Inverse depth is linear in the pixel coordinates on any plane. Its second difference is zero there, and one half jump at a
-    depth edge.
-
-    Parameters
-    ----------
-    depth
-        (H, W), metres; NaN where nothing was measured.
-
-    Returns
-    -------
-    (H, W) float64, metres; infinite where the pixel or a neighbour has no measurement, and on the border.
+    depth edge. Depth (H, W) and answer are in metres: NaN where nothing was measured becomes infinite, as do its neighbours and
+    the border.
     """
     inverse = 1 / np.asarray(depth, dtype=np.float64)
     bend = np.full((2, *inverse.shape), np.inf)
