@@ -63,7 +63,7 @@ def stages(paths: list[Path], rig, folder: Path) -> Stages:
         rng = np.random.default_rng(view.index)
         sample = run("all of make_sample", make_sample, view, rig, config, rng, decoder, depth)
         with ShardWriter(folder / "s.h5", view.scene, rig, view.tof.info, view.stereo.info, 1) as shard:
-            run("write", shard.add, sample)
+            run("write", shard.add, sample, path)
             run("verify, fsync", shard.seal, {})
     return run
 

@@ -17,8 +17,8 @@ import pytest
 from tests.sealed import delete, edit, replaced, reseal, set_attr
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError, FormatError
-from tofcapture.files.hdf import open_checked
-from tofcapture.files.layout import SHARD, MaskBit
+from tofcapture.files.hdf import create, open_checked
+from tofcapture.files.layout import SHARD, VIEW, MaskBit
 from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, object_of, write_manifest
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardReader, ShardWriter, TofMaps
 from tofcapture.frames import StereoInfo, TofInfo
@@ -144,6 +144,32 @@ def test_chunks_are_what_a_training_read_touches(tmp_path):
         assert file["gt/normals_2x"].chunks == (1, 12, 16, 3)
         assert all(file[f.path].fletcher32 for f in SHARD if f.chunk)
         assert all(file[f.path].attrs["units"] == f.units for f in SHARD)
+
+
+@pytest.mark.parametrize("filters", ["as written", "others", "another burst"])
+def test_a_burst_is_copied_as_it_is_packed(tmp_path, filters):
+    """The shard is the same with and without the view file, however that one is packed; a burst of another view is noticed."""
+    sample, view = make_sample(0), tmp_path / "view-000.h5"
+    with h5py.File(view, "w") as file:
+        field = VIEW["tof/raw"]
+        raw = sample.raw + np.uint16(filters == "another burst")
+        file.attrs.update(format=VIEW.format, version=VIEW.version)
+        if filters == "others":
+            file.create_dataset(field.path, data=raw, chunks=(3, 8, 6, 8), compression="lzf")
+        else:
+            create(file, field, raw.shape, raw.dtype)[...] = raw
+    digests = []
+    for name, path in (("a", None), ("b", view)):
+        with ShardWriter(
+            tmp_path / name / "mug.h5", "mug", RIG, INFO, StereoInfo("s", "2", STEREO), 1
+        ) as shard:
+            shard.add(sample, path)
+            if path and filters == "another burst":
+                with pytest.raises(DataError, match="/tof/raw read back differs"):
+                    shard.seal({})
+                return
+            digests.append(shard.seal({}))
+    assert digests[0] == digests[1]
 
 
 def _raw_sum(reader, queue=None):

@@ -174,8 +174,8 @@ def build_shard(
         made = work / task.path.name
         info = calibrated(first.tof.info, task.rig)
         with ShardWriter(made, task.scene, task.rig, info, first.stereo.info, len(task.views)) as shard:
-            for sample, error in _samples(task, decoder, pool):
-                shard.add(sample)
+            for path, (sample, error) in zip(task.views, _samples(task, decoder, pool), strict=True):
+                shard.add(sample, path)
                 mask = sample.ground_truth[2].mask
                 good.append(int((mask == 0).sum()))
                 seen = seen or not (mask & MaskBit.NOT_HIT).all()

@@ -84,23 +84,10 @@ def remember(path: Path, known: tuple[Identity, str] | None) -> None:
 
 
 def sealed_digest(path: Path, promised: str | None = None) -> str:
-    """Hash a file, once per process, and make sure that it is the one that was sealed.
+    """Hash a file, once per process, and make sure that it is the one that was sealed; hexadecimal.
 
-    Parameters
-    ----------
-    path
-        The file.
-    promised
-        Its digest in a manifest; ``None``: the one stored beside it counts. Without either there is nothing to compare with.
-
-    Returns
-    -------
-    SHA-256 of its bytes, hexadecimal.
-
-    Raises
-    ------
-    DataError
-        The file cannot be read, or its bytes are not those that were sealed.
+    Its digest in a manifest counts where one is promised, else the one beside it. Without either there is nothing to compare
+    with. :class:`DataError` when the file cannot be read, or its bytes are not those that were sealed.
     """
     expected = promised or stored_digest(path)
     try:
@@ -155,13 +142,9 @@ def write_text(path: Path, text: str) -> None:
 
 
 def seal(partial: Path, path: Path) -> str:
-    """Make a finished temporary file permanent and read-only.
+    """Make a finished temporary file permanent and read-only; returns its SHA-256, hexadecimal.
 
     The digest is stored first: a file under its final name always has one.
-
-    Returns
-    -------
-    SHA-256 of the file, hexadecimal.
     """
     digest = sha256_of(partial)
     fsync(partial)

@@ -32,7 +32,7 @@ from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.hdf import Array, create, find, json_attr, open_checked, read, text_attr, write_attrs
 from tofcapture.files.info import stereo_from, stereo_table, tof_from, tof_table
-from tofcapture.files.layout import SHARD
+from tofcapture.files.layout import SHARD, VIEW
 from tofcapture.files.seal import partial_path, remember, remembered, seal, verify
 from tofcapture.files.view import check_scene_name
 from tofcapture.frames import StereoInfo, TofFlag, TofInfo
@@ -336,6 +336,23 @@ def _rows(sample: Sample) -> dict[str, Array]:
     return {path: np.asarray(row) for path, row in rows.items()}
 
 
+def _copied(view_file: Path, target: h5py.Dataset, row: int) -> bool:
+    """Copy a view's burst as it is packed: unpacking aside, this is a fifth of the time that a view costs.
+
+    ``False``, and nothing done, where the two are not stored alike.
+    """
+    with open_checked(view_file, VIEW) as file:
+        source = find(file, VIEW["tof/raw"], view_file)
+        kinds = ("dtype", "compression", "shuffle", "fletcher32")
+        alike = all(getattr(source, kind) == getattr(target, kind) for kind in kinds)
+        if not alike or source.chunks != target.chunks[1:] or source.shape[1:] != source.chunks[1:]:
+            return False
+        for frame in range(len(source)):
+            mask, packed = source.id.read_direct_chunk((frame, 0, 0, 0))
+            target.id.write_direct_chunk((row, frame, 0, 0, 0), packed, mask)
+    return True
+
+
 def _digest(row: Array) -> bytes:
     return hashlib.sha256(np.ascontiguousarray(row).data).digest()
 
@@ -386,8 +403,11 @@ class ShardWriter:
             elif not field.optional:
                 raise FormatError(f"sample: expected /{field.path}, got none")
 
-    def add(self, sample: Sample) -> None:
-        """Append one sample; :class:`FormatError` when a row is missing or has another shape or dtype than the shard's."""
+    def add(self, sample: Sample, view_file: Path | None = None) -> None:
+        """Append one sample; :class:`FormatError` when a row is missing or has another shape or dtype than the shard's.
+
+        Told the view that it was made of, the writer copies that one's packed phase images.
+        """
         if self._file is None or self._added >= self._views:
             raise FormatError(f"{self._path}: expected {self._views} samples in an open writer, got one more")
         rows = _rows(sample)
@@ -404,7 +424,8 @@ class ShardWriter:
                 raise FormatError(
                     f"/{name}: expected {dataset.dtype} {dataset.shape[1:]} per view, got {got}"
                 )
-            dataset[self._added] = row
+            if name != "tof/raw" or view_file is None or not _copied(view_file, dataset, self._added):
+                dataset[self._added] = row
             dataset.flush()  # now, not when the last handle goes, which a debugger or profiler may hold: the same bytes
             self._written[name].append(_digest(row))
         self._added += 1

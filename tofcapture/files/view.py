@@ -140,7 +140,7 @@ def read_view(path: Path) -> View:
 
 
 def read_depth_view(path: Path) -> tuple[View, NDArray[np.float32]]:
-    """Read a view without x and y of its point map, which are two thirds of the work.
+    """Read a view without x and y of its point map, which are two thirds of the work; raises as :func:`read_view` does.
 
     Returns
     -------
@@ -148,11 +148,6 @@ def read_depth_view(path: Path) -> tuple[View, NDArray[np.float32]]:
         As :func:`read_view`, but every point of the map is NaN.
     depth
         (SH, SW) z of the map, stereo frame, metres.
-
-    Raises
-    ------
-    DataError, FormatError
-        As :func:`read_view`.
     """
     path = Path(path)
     with _opened(path) as file:
