@@ -27,8 +27,6 @@ OURS = Losses(
     reweight=False,
     uncertainty="laplace",
     normals="angle",
-    chamfer_distance="plane",
-    chamfer_softness=3.0,
     **(
         UNLIKE := {
             "delta": 0.01,
@@ -77,11 +75,10 @@ def test_every_part_is_its_loss_of_the_stage_s_maps_times_its_weight(weights, st
     lambda_error = error if weights.reweight else truth
     uncertainty, angles = (laplace_loss, angle_loss) if weights is OURS else (error_map_loss, cosine_loss)
     clouds = unproject(depth, K), unproject(truth, K), target.good, target.good, weights.jitter
-    plane = {"normals": target.normals, "softness": 3e-6} if weights is OURS else {}
     expected = {
         "depth": weights.depth * reweighted_smooth_l1(depth, truth, lambda_error, weight, weights.delta),
         "error": weights.error * uncertainty(error, depth, truth, weight, weights.delta),
-        "chamfer": weights.chamfer * (1e3**2 * robust_chamfer(*clouds, **plane).loss).mean(),
+        "chamfer": weights.chamfer * (1e3**2 * robust_chamfer(*clouds).loss).mean(),
         "normal": weights.normal * angles(normals, target.normals, weight),
     }
     found = objective(weights, stage, estimate, target, K)

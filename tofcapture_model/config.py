@@ -19,6 +19,10 @@ from tofcapture.errors import ConfigError
 STAGES = ("depth", "normal", "refine", "joint")
 OURS, BASELINES = ("paper", "compact"), ("su2018", "guo2018", "coarse-fine")
 SOURCES = {"raw": 8, "confidence": 1, "depth": 1}
+_RETIRED = {
+    "chamfer_softness": 0.0,
+    "chamfer_distance": "point",
+}  # keys of old checkpoints, by what they had to be
 
 
 def _require(fine: bool, where: str, expected: str, got: object) -> None:
@@ -100,10 +104,6 @@ class Losses:
         Distance of normals: ``cosine``, eq. 3 (paper), or ``angle``, whose gradient does not fade with the angle.
     depth, chamfer, error, normal
         Weights of eq. 1, eq. 2 (in 1/mm^2), the error map, the normals.
-    chamfer_softness
-        mm^2: above 0 the least of the seven distances of eq. 2 is a soft one, which pulls even where a shifted copy fits best.
-    chamfer_distance
-        ``point``, to the nearest point (paper), or ``plane``, to the tangent plane there.
     context
         Weight of measured surface outside the object crop relative to the object.
     """
@@ -115,8 +115,6 @@ class Losses:
     normals: str = "cosine"
     depth: float = 1.0
     chamfer: float = 0.01
-    chamfer_softness: float = 0.0
-    chamfer_distance: str = "point"
     error: float = 1.0
     normal: float = 1.0
     context: float = 0.0
@@ -125,9 +123,7 @@ class Losses:
         fine = self.delta > 0 and self.jitter >= 0
         _require(fine, "losses", "delta > 0, jitter >= 0", (self.delta, self.jitter))
         _require_one(("l1", "laplace"), "losses.uncertainty", self.uncertainty)
-        _require_one(("point", "plane"), "losses.chamfer_distance", self.chamfer_distance)
         _require_one(("cosine", "angle"), "losses.normals", self.normals)
-        _require(self.chamfer_softness >= 0, "losses.chamfer_softness", "mm^2 >= 0", self.chamfer_softness)
         weights = (self.depth, self.chamfer, self.error, self.normal)
         fine = min(*weights, self.context) >= 0 and max(weights) > 0
         _require(fine, "losses", "weights >= 0, one of depth, chamfer, error, normal above", self)
@@ -235,6 +231,7 @@ def _changed(part: Part, table: Any, where: str) -> Part:
     if not isinstance(table, Mapping):
         raise ConfigError(f"{where}: expected a table, got {table!r}")
     known = {f.name for f in fields(part)}
+    table = {key: value for key, value in table.items() if key in known or _RETIRED.get(key) != value}
     unknown = table.keys() - known
     if unknown:
         raise ConfigError(

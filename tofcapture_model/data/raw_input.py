@@ -1,4 +1,4 @@
-"""What a prediction starts from: a burst of raw frames from a view file, a shard or a plain array, and a look at whether it makes sense."""
+"""Read what a prediction starts from: raw frames of a view file, a shard or a plain array, if they make sense."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoder, ambiguity, frequencies
 from tofcapture.rig import RangeError, load_rig
 
+Float32 = NDArray[np.float32]
 NOMINAL_CAMERA = Camera(width=240, height=180, fx=190.6186, fy=200.7526, cx=116.8406, cy=101.4767)
 """A real 240 x 180 sensor of 20/100 MHz; used for a plain array when no rig is given."""
 
@@ -31,7 +32,7 @@ NOMINAL_RANGE_ERRORS = (
         per_kelvin=-1.8e-4,
     ),
 )
-"""Range errors measured on that sensor; taken for a plain array without a rig whose two frequencies agree with them and not without."""
+"""Range errors measured on that sensor; taken for an array without a rig if its two frequencies agree with them only."""
 
 CHANNELS = "20 MHz at 0, 90, 180, 270 deg, then 100 MHz at the same"
 SATURATION = 4095.0  # counts, of a 12-bit sensor: taken for an array unless it is said
@@ -83,26 +84,19 @@ def _which(raw: NDArray[Any], frame: int | None) -> str:
 def taken(
     raw: NDArray[Any], frame: int | None, saturation: float, celsius: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Take one frame of a burst, or with ``frame = None`` the mean (taps are linear, so it may be taken).
+    """Take one frame (K, H, W) of a burst, or with ``frame = None`` the mean, and its sensor temperature.
 
-    A tap that is saturated in any frame is saturated in the mean: clipping took from its mean what nobody knows. The decoder goes by
-    the taps' values, so in the mean such a tap gets the saturation value, as it has in a single frame
-    (:meth:`tofcapture.ops.phase.Decoder.burst` has the same rule).
+    A tap that is saturated in any frame gets the saturation value in the mean: clipping took from its mean what nobody knows.
+    :meth:`tofcapture.ops.phase.Decoder.burst` has the same rule.
 
     Parameters
     ----------
-    raw
-        (F, K, H, W) taps.
+    raw, celsius
+        (F, K, H, W) taps, (F,) sensor temperatures.
     frame
         0 to F - 1, or ``None``.
     saturation
         Raw value from which a tap is saturated.
-    celsius
-        (F,) sensor temperatures.
-
-    Returns
-    -------
-    (K, H, W) float64 taps, and their sensor temperature.
 
     Raises
     ------
@@ -131,17 +125,16 @@ def read_input(
     Parameters
     ----------
     path
-        View file or shard (``.h5``), or an array (8, H, W) or (F, 8, H, W) (``.npy``, or ``.npz`` with one array or with one called
-        ``raw``): counts in the order of :data:`CHANNELS`.
+        View file or shard (``.h5``), or an array (8, H, W) or (F, 8, H, W), ``.npy`` or ``.npz`` with one array or one called
+        ``raw``: counts in the order of :data:`CHANNELS`.
     view
         Of a shard.
     rig
-        ``rig.toml`` for an array; without it, nominal intrinsics, and no range errors or :data:`NOMINAL_RANGE_ERRORS`, whichever the
-        two frequencies agree with; ``assumed`` says which.
+        ``rig.toml`` for an array; without it, nominal values, which ``assumed`` names.
     saturation
         Counts at which the sensor of an array saturates; ``None``: :data:`SATURATION`.
     frame
-        Of an array, what will be used and is looked at: one frame, or ``None``: the mean.
+        Of an array, what is looked at: one frame, or ``None``: the mean.
 
     Raises
     ------
@@ -205,7 +198,7 @@ def _load(path: Path) -> NDArray[Any]:
 
 
 def _without_rig(taps: NDArray[np.float64], plain: TofInfo, path: Path, which: str) -> tuple[TofInfo, str]:
-    """Take a camera that corrects its ranges itself, or else the sensor of :data:`NOMINAL_RANGE_ERRORS`, as the data say."""
+    """Take no range errors or :data:`NOMINAL_RANGE_ERRORS`, as the data say."""
     try:
         check_taps(taps, plain, path, which)
     except DataError as err:
@@ -221,19 +214,19 @@ def _without_rig(taps: NDArray[np.float64], plain: TofInfo, path: Path, which: s
 def _check_shape(raw: NDArray[Any], camera: Camera, path: Path) -> None:
     """Refuse anything but (F, 8, H, W) numbers of more than 8 bits."""
     h, w = camera.shape
-    shape, fine = raw.shape[1:], raw.ndim == 4 and len(raw) > 0
-    if fine and shape == (8, h, w) and raw.dtype.kind in "uif" and raw.dtype.itemsize > 1:
+    shape = raw.shape[1:] if raw.ndim == 4 and len(raw) > 0 else ()
+    if shape == (8, h, w) and raw.dtype.kind in "uif" and raw.dtype.itemsize > 1:
         return
-    hint = "--rig names a camera of another size"
-    if fine and shape == (h, w, 8):
-        hint = "np.moveaxis(raw, -1, -3) puts the channels before rows and columns"
-    elif fine and shape == (8, w, h):
-        hint = "np.swapaxes(raw, -1, -2) puts the rows before the columns"
-    elif fine and shape == (8, h, w):
-        hint = "counts as the sensor gives them, such as uint16"
-    expected = f"(8, {h}, {w}) or (F, 8, {h}, {w})"
-    got = raw.shape[1:] if raw.shape[:1] == (1,) else raw.shape
-    raise DataError(f"{path}: expected numbers of shape {expected}, got {raw.dtype} {got}", hint=hint)
+    hints = {
+        (h, w, 8): "np.moveaxis(raw, -1, -3) puts the channels before rows and columns",
+        (8, w, h): "np.swapaxes(raw, -1, -2) puts the rows before the columns",
+        (8, h, w): "counts as the sensor gives them, such as uint16",
+    }
+    raise DataError(
+        f"{path}: expected numbers of shape (8, {h}, {w}) or (F, 8, {h}, {w}), "
+        f"got {raw.dtype} {raw.shape[1:] if raw.shape[:1] == (1,) else raw.shape}",
+        hint=hints.get(shape, "--rig names a camera of another size"),
+    )
 
 
 def expect_finite(raw: NDArray[Any], where: str) -> None:
@@ -269,21 +262,12 @@ def _check_unit(raw: NDArray[Any], saturation: float, path: Path) -> str:
 
 
 def check_taps(raw: NDArray[np.float64], info: TofInfo, path: Path, which: str = "") -> None:
-    """Refuse taps that cannot be what ``info`` says: other units, other channels, no signal.
+    """Refuse taps (8, H, W) that cannot be what ``info`` says: other units, other channels, no signal.
 
-    Taps half a period apart add up to twice the offset, so ``C_0 - C_1 + C_2 - C_3`` vanishes for the right order; ranges of both
-    frequencies agree up to noise and calibration; depths lie within the reach of the rig. Looked at are the brighter half of
-    the pixels below saturation, and the bounds are wide: what is refused is not merely noisy. A start tap that is wrong by
-    the same quarter in both frequencies passes: no frame can tell.
-
-    Parameters
-    ----------
-    raw
-        (8, H, W) one frame or the mean of some.
-    info
-        What they are taken for: four phases of the low frequency, then of the high one.
-    path, which
-        File and, within it, frame: for the message.
+    Taps half a period apart add up to twice the offset, so ``C_0 - C_1 + C_2 - C_3`` vanishes for the right order. Ranges of
+    both frequencies agree up to noise and calibration; depths lie within the reach of the rig. Looked at are the brighter half
+    of the pixels below saturation, and the bounds are wide. A start tap that is wrong by the same quarter in both frequencies
+    passes: no frame can tell. ``path`` and ``which`` name file and frame.
 
     Raises
     ------
@@ -310,11 +294,7 @@ def check_taps(raw: NDArray[np.float64], info: TofInfo, path: Path, which: str =
 
 
 def _contradiction(
-    raw: NDArray[np.float64],
-    amplitude: NDArray[np.float32],
-    gap: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    info: TofInfo,
+    raw: NDArray[np.float64], amplitude: Float32, gap: Float32, depth: Float32, info: TofInfo
 ) -> str:
     """Say what of taps (8, N), amplitudes (2, N), gaps (N,) and depths (N,) cannot be; nothing when all is well."""
     taps = raw.reshape(2, 4, -1)

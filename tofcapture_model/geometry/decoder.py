@@ -28,15 +28,7 @@ _HELD = 1 << 25  # elements of the table of distances
 
 
 class Taps(NamedTuple):
-    """What is sent to the device for one frame.
-
-    Attributes
-    ----------
-    raw
-        (K, H, W) float32, as the sensor gave them.
-    celsius
-        () float32 sensor temperature; NaN: unknown.
-    """
+    """What is sent to the device for one frame: taps (K, H, W) float32, sensor temperature () float32, NaN if unknown."""
 
     raw: Tensor
     celsius: Tensor
@@ -53,7 +45,7 @@ class _Range:
         self.per_kelvin, self.reference, self.dark = tables.per_kelvin, tables.reference, float(tables.dark)
 
     def __call__(self, in_phase: Tensor, quadrature: Tensor, amplitude: Tensor, celsius: Tensor) -> Tensor:
-        """(H, W) metres, without what is known of its systematic error."""
+        """Compute the range (H, W), metres, without what is known of its systematic error."""
         turns = torch.atan2(quadrature, in_phase) / (2 * math.pi)
         steps = (turns - torch.floor(turns)) * (self.unambiguous / self.step) - self.fixed
         if self.dark:
@@ -68,14 +60,7 @@ class _Range:
 
 
 class TorchDecoder:
-    """Decodes single frames of one camera on a device.
-
-    Parameters
-    ----------
-    info, camera
-        As for :func:`tofcapture_model.data.make_frame`.
-    device
-        Where taps will be and the frame shall be.
+    """Decodes single frames of one camera on a device; arguments as for :func:`tofcapture_model.data.make_frame`.
 
     Raises
     ------
@@ -105,20 +90,14 @@ class TorchDecoder:
         self._intrinsics = intrinsics_of(camera).to(device)
 
     def taps(self, raw: NDArray[Any], celsius: float) -> Taps:
-        """Send one frame (K, H, W), any real dtype, and its temperature to the device.
-
-        Raises
-        ------
-        DataError
-            ``raw`` is of another shape.
-        """
+        """Send one frame (K, H, W), any real dtype, and its temperature to the device; :class:`DataError` for another shape."""
         expected = (self._demodulation.shape[1], *self._length.shape)
         if raw.shape != expected:
             raise DataError(f"decode: expected raw of shape {expected}, got {raw.shape}")
-        place = self._length.device
+        device = self._length.device
         return Taps(
-            torch.from_numpy(np.ascontiguousarray(raw, dtype=np.float32)).to(place),
-            torch.tensor(celsius, dtype=torch.float32).to(place),
+            torch.from_numpy(np.ascontiguousarray(raw, dtype=np.float32)).to(device),
+            torch.tensor(celsius, dtype=torch.float32).to(device),
         )
 
     def __call__(self, taps: Taps) -> Frame:

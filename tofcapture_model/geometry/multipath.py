@@ -109,10 +109,8 @@ def exchange_error(
     ----------
     surfaces
         (B, 5, H, W), see :func:`surface`.
-    intrinsics
-        (B, 4 or 9).
-    hz
-        Modulation frequency.
+    intrinsics, hz
+        (B, 4 or 9), and the modulation frequency.
     step
         Pixels per patch; time goes with its inverse fourth power.
     margin

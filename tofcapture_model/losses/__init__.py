@@ -13,7 +13,7 @@ from torch import Tensor
 from tofcapture_model.config import Losses
 from tofcapture_model.frame import Estimate, Target
 from tofcapture_model.geometry.maps import unit, unproject
-from tofcapture_model.losses.chamfer import Chamfer, robust_chamfer
+from tofcapture_model.losses.chamfer import robust_chamfer
 
 _PER_MM2 = 1e6  # m^2 to mm^2, so that the Chamfer weight is of the order of the others
 DELTA = 0.020  # m, paper: threshold 20 (mm) of eq. 1
@@ -134,19 +134,12 @@ def objective(
         uncertainty = laplace_loss if weights.uncertainty == "laplace" else error_map_loss
         told = uncertainty(estimate.error, depth, target.depth, weight, weights.delta)
         parts["error"] = weights.error * told
-        if weights.chamfer:
-            chamfer = _chamfer(weights, depth, target, intrinsics)
+        if weights.chamfer:  # both clouds live where the ground truth does
+            p, q = unproject(depth, intrinsics), unproject(target.depth, intrinsics)
+            chamfer = robust_chamfer(p, q, target.good, target.good, weights.jitter)
             parts["chamfer"] = weights.chamfer * _PER_MM2 * chamfer.loss.mean()
             winners = torch.bincount(chamfer.winner.cpu(), minlength=7).float()
     if stage != "depth":
         distance = angle_loss if weights.normals == "angle" else cosine_loss
         parts["normal"] = weights.normal * distance(normals, target.normals, weight)
     return Objective(torch.stack(list(parts.values())).sum(), parts, winners)
-
-
-def _chamfer(weights: Losses, depth: Tensor, target: Target, intrinsics: Tensor) -> Chamfer:
-    """Robust Chamfer between the clouds over the good pixels: both live where the ground truth does."""
-    p, q = unproject(depth, intrinsics), unproject(target.depth, intrinsics)
-    normals = target.normals if weights.chamfer_distance == "plane" else None
-    softness = weights.chamfer_softness / _PER_MM2
-    return robust_chamfer(p, q, target.good, target.good, weights.jitter, normals=normals, softness=softness)

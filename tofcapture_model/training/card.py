@@ -47,7 +47,7 @@ def write_card(
 
     Returns
     -------
-    What the checkpoint should remember beside ``provenance``: ``device``, ``torch``.
+    What the checkpoint should remember besides: ``device``, ``torch``.
     """
     facts = {"device": _device_name(device), "torch": torch.__version__}
     rows = read_metrics(out / "metrics.jsonl")
@@ -161,24 +161,17 @@ def _value(value: Any) -> str:
 
 
 def _curves(rows: Sequence[Mapping[str, Any]]) -> str:
-    steps = [row for row in rows if "total" in row]
-    tables = [
-        _table(
-            ("step", "stage", "rate", "loss"),
-            [(str(r["step"]), r["stage"], f"{r['rate']:.2g}", f"{r['total']:.4g}") for r in _thinned(steps)],
-        )
-    ]
-    checks = [row for row in rows if "val_mae" in row]
+    steps, checks = ([row for row in rows if key in row] for key in ("total", "val_mae"))
+    losses = [(str(r["step"]), r["stage"], f"{r['rate']:.2g}", f"{r['total']:.4g}") for r in _thinned(steps)]
+    tables = [_table(("step", "stage", "rate", "loss"), losses)]
     if checks:
         found = [
             (str(r["step"]), r["stage"], f"{1e3 * r['val_mae']:.2f}", f"{r['val_angle_deg']:.2f}")
             for r in _thinned(checks)
         ]
         tables.append(_table(("step", "stage", "val MAE mm", "val normals deg"), found))
-    return (
-        "\n\n".join(tables)
-        + "\n\nEvery logged step is in `metrics.jsonl`; `tensorboard --logdir .` draws them."
-    )
+    tables.append("Every logged step is in `metrics.jsonl`; `tensorboard --logdir .` draws them.")
+    return "\n\n".join(tables)
 
 
 def _thinned(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

@@ -1,11 +1,9 @@
-"""Nearest neighbours of two clouds on one pixel grid: the answer's form, clouds cut into tiles, and the brute-force oracle.
+"""Nearest neighbours of two clouds on one pixel grid: the brute-force oracle, and clouds cut into tiles.
 
 Both engines cut clouds into square tiles of the grid. Pixels without a point lie at infinity, far from everything.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,24 +12,11 @@ from torch.nn.functional import pad
 _AT_ONCE = 1 << 22  # pairs that are compared at once
 
 
-class Found(NamedTuple):
-    """Nearest neighbours for S shifts s.
-
-    Attributes
-    ----------
-    squared
-        (S, 2, H, W) m^2: of every p + s to Q, and of every q to P + s; meaningless where masked.
-    index
-        (S, 2, H, W) int64 flat pixel of that neighbour.
-    """
-
-    squared: Tensor
-    index: Tensor
-
-
 @torch.no_grad()
-def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> Found:
-    """Find the nearest neighbours of every p + s in Q and of every q in P + s by comparing all pairs, on any device.
+def nearest_of_best(
+    p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor
+) -> tuple[int, Tensor, Tensor]:
+    """Find the shift s of the least symmetric mean squared distance of P + s and Q, and its neighbours; all pairs are compared.
 
     Parameters
     ----------
@@ -41,24 +26,37 @@ def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor
         (H, W) bool: which pixels belong to the clouds; neither is empty.
     shifts
         (S, 3) metres.
+
+    Returns
+    -------
+    index of the shift
+    neighbours
+        (2, H, W) int64 flat pixel of the nearest of every p + s in Q, and of every q in P + s; meaningless where masked.
+    scores
+        (S,) m^2: the distance of that shift, and for every other one a bound from below that is not less.
     """
-    shape = (len(shifts), 2, *p_mask.shape)
-    squared = torch.zeros(shape, device=p.device)
-    index = torch.zeros(shape, dtype=torch.int64, device=p.device)
+    squared = torch.zeros((len(shifts), 2, *p_mask.shape), device=p.device)
+    index = torch.zeros(squared.shape, dtype=torch.int64, device=p.device)
     of_p, of_q = (mask.flatten().nonzero()[:, 0] for mask in (p_mask, q_mask))
     for k, shift in enumerate(shifts.unbind()):
         ways = ((p, of_p, q, of_q, shift), (q, of_q, p, of_p, -shift))
         for way, (own, of_own, other, of_other, moved) in enumerate(ways):
             queries, points = own.flatten(1)[:, of_own], other.flatten(1)[:, of_other]
-            best, which = [], []
-            for some in queries.split(max(_AT_ONCE // len(of_other), 1), dim=1):
-                apart = (some[:, :, None] - points[:, None]) + moved[:, None, None]
-                least, at = apart.square().sum(0).min(1)
-                best.append(least)
-                which.append(of_other[at])
-            squared[k, way].view(-1)[of_own] = torch.cat(best)
-            index[k, way].view(-1)[of_own] = torch.cat(which)
-    return Found(squared, index)
+            found = [
+                ((some[:, :, None] - points[:, None]) + moved[:, None, None]).square().sum(0).min(1)
+                for some in queries.split(max(_AT_ONCE // len(of_other), 1), dim=1)
+            ]
+            squared[k, way].view(-1)[of_own] = torch.cat([least for least, _ in found])
+            index[k, way].view(-1)[of_own] = of_other[torch.cat([at for _, at in found])]
+    return least_of(squared, index, p_mask, q_mask)
+
+
+def least_of(squared: Tensor, index: Tensor, p_mask: Tensor, q_mask: Tensor) -> tuple[int, Tensor, Tensor]:
+    """Choose the best of all shifts' squares and neighbours, each (S, 2, H, W): see :func:`nearest_of_best`."""
+    masks = torch.stack([p_mask, q_mask])
+    scores = (torch.where(masks, squared, 0.0).sum((2, 3)) / masks.sum((1, 2))).sum(1)
+    best = int(scores.argmin())
+    return best, index[best], scores
 
 
 def tiles_of(images: Tensor, side: int) -> Tensor:

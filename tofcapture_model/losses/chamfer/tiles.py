@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from tofcapture_model.losses.chamfer.neighbours import Found, image_of, pixels_of, tiles_of
+from tofcapture_model.losses.chamfer.neighbours import image_of, least_of, pixels_of, tiles_of
 
 SIDE = 8
 POINTS = SIDE**2
@@ -21,8 +21,10 @@ BLOCK = 256  # boxes that are looked at together
 
 
 @torch.no_grad()
-def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> Found:
-    """Answer as :func:`tofcapture_model.losses.chamfer.neighbours.nearest` does, on a GPU."""
+def nearest_of_best(
+    p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor
+) -> tuple[int, Tensor, Tensor]:
+    """Answer as :func:`tofcapture_model.losses.chamfer.neighbours.nearest_of_best` does, on a GPU."""
     size = (p_mask.shape[0], p_mask.shape[1])
     clouds = [tiles_of(torch.where(m, c.float(), torch.inf), SIDE) for c, m in ((p, p_mask), (q, q_mask))]
     points = torch.stack(clouds)
@@ -38,7 +40,7 @@ def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor
             POINTS=POINTS, PART=PART, BLOCK=BLOCK, num_warps=1,
         )  # fmt: skip
     index = pixels_of(image_of(codes, size, SIDE), size, SIDE)
-    return Found(image_of(squared, size, SIDE), index)
+    return least_of(image_of(squared, size, SIDE), index, p_mask, q_mask)
 
 
 @triton.jit

@@ -7,9 +7,8 @@ instructions. A query starts from a guess, mostly its neighbour's answer, and lo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tofcapture.compiled import compiled
-from tofcapture_model.losses.chamfer.neighbours import Found, image_of, pixels_of, tiles_of
+from tofcapture_model.losses.chamfer.neighbours import image_of, pixels_of, tiles_of
 
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
@@ -145,18 +144,6 @@ def _search(
         sums[g] = total
 
 
-@compiled
-def _bound(own: Float32, squared: Float32, away: float, sums: NDArray[np.float64]) -> None:
-    """Raise sums (L,) to what squares must at least add up to ``away`` metres from where they are these (L, 16)."""
-    for g in range(len(sums)):
-        total = 0.0
-        for k in range(FAN):
-            if own[g, 0, k] < _INF:
-                least = max(np.sqrt(float(squared[g, k])) * (1.0 - _MARGIN) - away, 0.0)
-                total += least * least
-        sums[g] = max(sums[g], total)
-
-
 class _Tree:
     """A cloud's tree: leaves (L, 3, 16), boxes (M, 6, 16), and of each level of boxes its first, its width, its children's width.
 
@@ -186,16 +173,13 @@ class _Tree:
 class _Shift:
     """What is known of one shift: answers of P in Q (way 0) and of Q in P, by the leaves of who asks."""
 
-    def __init__(self, trees: tuple[_Tree, _Tree], move: Sequence[float]) -> None:
-        shape = (len(trees[0].leaves), FAN)
+    def __init__(self, trees: Sequence[_Tree], move: Sequence[float]) -> None:
+        shape = (2, len(trees[0].leaves), FAN)
         self.trees, self.move = trees, move
-        self.squared = np.zeros((2, *shape), np.float32)
-        self.whose = np.broadcast_to(
-            np.arange(math.prod(shape), dtype=np.int32).reshape(shape), (2, *shape)
-        ).copy()
-        self.sums = np.zeros(
-            (2, len(trees[0].leaves))
-        )  # of a leaf's squares; a bound from below until it is asked
+        self.squared = np.zeros(shape, np.float32)
+        self.whose = np.empty(shape, np.int32)
+        self.whose[:] = np.arange(shape[1] * FAN).reshape(shape[1:])  # the same pixel of the other cloud
+        self.sums = np.zeros(shape[:2])  # of a leaf's squares; a bound from below until it is asked
 
     def ask(self, way: int, which: Int64) -> None:
         """Find the neighbours of the points of some leaves, ascending."""
@@ -207,95 +191,63 @@ class _Shift:
         )  # fmt: skip
 
     def learn(self, known: _Shift) -> None:
-        """Take the answers of another shift as guesses, and as bounds: none changes by more than the shift does."""
-        apart = math.dist(self.move, known.move)
-        apart += _MARGIN * (math.hypot(*self.move) + math.hypot(*known.move))
+        """Take the answers of another shift as guesses, and as bounds: no distance changes by more than the shift does."""
+        away = math.dist(self.move, known.move)
+        away += _MARGIN * (math.hypot(*self.move) + math.hypot(*known.move))
         self.whose[:] = known.whose
-        for way in (0, 1):
-            _bound(self.trees[way].leaves, known.squared[way], apart, self.sums[way])
+        least = np.maximum(np.sqrt(known.squared) * np.float32(1 - 2 * _MARGIN) - np.float32(away), 0)
+        self.sums = np.maximum(self.sums, np.square(least).sum(2, dtype=np.float64))
 
     def shares(self) -> NDArray[np.float64]:
         """(2, L) parts of the symmetric mean squared distance, m^2; from below until everything was asked."""
-        return np.stack([sums / tree.count for sums, tree in zip(self.sums, self.trees, strict=True)])
+        return self.sums / np.array([[tree.count] for tree in self.trees])
 
     def seen(self) -> float:
         """Symmetric mean squared distance, m^2; from below until everything was asked."""
         return float(self.shares().sum())
 
 
-class _Asking:
-    """Trees of two clouds, what is known of every shift, and threads that ask; answers do not depend on their number."""
-
-    def __init__(self, p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> None:
-        self.size = (p_mask.shape[0], p_mask.shape[1])
-        workers = min(torch.get_num_threads(), 1 + int(p_mask.sum() + q_mask.sum()) // _WORTH_A_THREAD)
-        self.pool = ThreadPoolExecutor(workers) if workers > 1 else None
-        trees = (_Tree(p, p_mask), _Tree(q, q_mask))
-        self.shifts = [_Shift(trees, move) for move in shifts.tolist()]
-        self.leaves = len(trees[0].leaves)
-
-    def ask(self, shifts: Sequence[_Shift], which: NDArray[np.bool_]) -> None:
-        """Ask the leaves ``which`` (2, L) of P and of Q for some shifts."""
-        tasks: list[Callable[[], None]] = []
-        for way in (0, 1):
-            leaves = which[way].nonzero()[0]
-            parts = [leaves[k : k + _TASK] for k in range(0, len(leaves), _TASK)]
-            tasks += [partial(shift.ask, way, part) for shift in shifts for part in parts]
-        if self.pool is None:
-            for task in tasks:
-                task()
-        else:
-            list(self.pool.map(lambda task: task(), tasks))
-
-    def found(self, shifts: Sequence[_Shift]) -> Found:
-        """End the threads and join the answers to images."""
-        if self.pool is not None:
-            self.pool.shutdown()
-        squared, codes = (
-            torch.from_numpy(np.stack(x)) for x in zip(*((s.squared, s.whose) for s in shifts), strict=True)
-        )
-        return Found(
-            image_of(squared, self.size, SIDE), pixels_of(image_of(codes, self.size, SIDE), self.size, SIDE)
-        )
-
-
-@torch.no_grad()
-def nearest(p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor) -> Found:
-    """Answer as :func:`tofcapture_model.losses.chamfer.neighbours.nearest` does, on the CPU."""
-    asking = _Asking(p, q, p_mask, q_mask, shifts)
-    asking.ask(asking.shifts, np.ones((2, asking.leaves), bool))
-    return asking.found(asking.shifts)
+def _ask(pool: ThreadPoolExecutor, shifts: Sequence[_Shift], which: NDArray[np.bool_]) -> None:
+    """Ask the leaves ``which`` (2, L) of P and of Q for some shifts; answers do not depend on the number of threads."""
+    tasks: list[Future[None]] = []
+    for way in (0, 1):
+        leaves = which[way].nonzero()[0]
+        for part in (leaves[k : k + _TASK] for k in range(0, len(leaves), _TASK)):
+            tasks += [pool.submit(shift.ask, way, part) for shift in shifts]
+    for task in tasks:
+        task.result()
 
 
 @torch.no_grad()
 def nearest_of_best(
     p: Tensor, q: Tensor, p_mask: Tensor, q_mask: Tensor, shifts: Tensor
-) -> tuple[int, Found, Tensor]:
-    """Find the shift of the least symmetric mean squared distance, and its neighbours, exactly.
+) -> tuple[int, Tensor, Tensor]:
+    """Answer as :func:`tofcapture_model.losses.chamfer.neighbours.nearest_of_best` does, on the CPU.
 
     A sample of leaves tells the likeliest shift, which is asked everything. By the triangle inequality its answers bound those
     of the others from below. Answers replace bounds until a shift's sum exceeds the best one's: it cannot win.
-
-    Returns
-    -------
-    index of the shift, its Found (1, 2, H, W), (S,) m^2: its distance, and for every other shift a bound from below
     """
-    asking = _Asking(p, q, p_mask, q_mask, shifts)
-    sample = np.broadcast_to(np.arange(asking.leaves) // _TOGETHER % _SAMPLE == 0, (2, asking.leaves))
-    asking.ask(asking.shifts, sample)
-    best, *others = sorted(asking.shifts, key=_Shift.seen)
-    asking.ask([best], ~sample)
-    for shift in others:
-        shift.learn(best)
-    # bounds are loosest where the best one's squares are large: these leaves are asked first
-    order = np.argsort(-best.shares().ravel(), kind="stable")
-    for some in np.array_split(order, min(max(len(order) // _STEP, 1), _STEPS)):
-        others = [shift for shift in others if shift.seen() < best.seen()]
-        if not others:
-            break
-        step = np.zeros(2 * asking.leaves, bool)
-        step[some] = True
-        asking.ask(others, step.reshape(2, -1))
+    trees = _Tree(p, p_mask), _Tree(q, q_mask)
+    leaves, size = len(trees[0].leaves), (p_mask.shape[0], p_mask.shape[1])
+    every = [_Shift(trees, move) for move in shifts.tolist()]
+    sample = np.broadcast_to(np.arange(leaves) // _TOGETHER % _SAMPLE == 0, (2, leaves))
+    workers = min(torch.get_num_threads(), 1 + (trees[0].count + trees[1].count) // _WORTH_A_THREAD)
+    with ThreadPoolExecutor(workers) as pool:
+        _ask(pool, every, sample)
+        best, *others = sorted(every, key=_Shift.seen)
+        _ask(pool, [best], ~sample)
+        for shift in others:
+            shift.learn(best)
+        # bounds are loosest where the best one's squares are large: these leaves are asked first
+        order = np.argsort(-best.shares().ravel(), kind="stable")
+        for some in np.array_split(order, min(max(len(order) // _STEP, 1), _STEPS)):
+            others = [shift for shift in others if shift.seen() < best.seen()]
+            if not others:
+                break
+            step = np.zeros(2 * leaves, bool)
+            step[some] = True
+            _ask(pool, others, step.reshape(2, -1))
     best = min([best, *others], key=_Shift.seen)
-    scores = torch.tensor([shift.seen() for shift in asking.shifts], dtype=torch.float32)
-    return asking.shifts.index(best), asking.found([best]), scores
+    scores = torch.tensor([shift.seen() for shift in every], dtype=torch.float32)
+    index = pixels_of(image_of(torch.from_numpy(best.whose), size, SIDE), size, SIDE)
+    return every.index(best), index, scores
