@@ -50,9 +50,8 @@ def _checked_device(name: str) -> str:
     try:
         torch.empty(0, device=name)
     except (RuntimeError, AssertionError) as err:
-        raise ConfigError(
-            f"--device {name}: {str(err).splitlines()[0]}", hint="--device cpu always works"
-        ) from err
+        said = str(err).splitlines()[0]
+        raise ConfigError(f"--device {name}: {said}", hint="--device cpu always works") from err
     return name
 
 
@@ -75,24 +74,14 @@ _not_negative = _number(int, "a whole number >= 0", lambda x: x >= 0)
 
 def _configure_train(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add(
-        "dataset",
-        type=Path,
-        nargs="+",
-        help="folders that build-dataset wrote; the first one's split val validates",
-    )
+    add("dataset", type=Path, nargs="+", help="folders of build-dataset; the first one's split val validates")
     add("--out", type=Path, required=True, help="folder of the run; running again there goes on")
     add("--preset", choices=presets(), help="where to start from (default: compact)")
     add("--config", type=Path, help="TOML with differences from a preset")
     add("--epochs", type=_count, help="of every stage, instead of the configuration's")
     add("--minutes", type=_positive, help="train for so long; schedules follow the clock")
     add("--seed", type=_not_negative, help="of weights, order and crops")
-    add(
-        "--workers",
-        type=_not_negative,
-        default=0,
-        help="processes that read data (default: 0, it stays in memory)",
-    )
+    add("--workers", type=_not_negative, default=0, help="processes that read data (default: 0, in memory)")
     origin = "fine-tune: start from a checkpoint, a run's folder, or 'bundled' (default preset: fine-tune)"
     add("--from", dest="start", metavar="WEIGHTS", help=origin)
     add("--cache", type=Path, help="read frames from what `tofcapture pack` wrote")
@@ -101,9 +90,8 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
 
 def _config(args: argparse.Namespace) -> Config:
     if args.config and args.preset:
-        raise ConfigError(
-            "--config and --preset exclude each other", hint='write preset = "..." into the TOML'
-        )
+        hint = 'write preset = "..." into the TOML'
+        raise ConfigError("--config and --preset exclude each other", hint=hint)
     usual = "fine-tune" if args.start else "compact"
     config = load_config(args.config) if args.config else preset(args.preset or usual)
     return config if args.seed is None else replace(config, training=replace(config.training, seed=args.seed))
@@ -137,20 +125,14 @@ def _train(args: argparse.Namespace) -> Outcome:
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", type=Path, help="folder that build-dataset wrote")
-    weights = (
-        "checkpoint or folder of a run (default: the bundled weights); with --suite, NAME=PATH of several"
-    )
+    weights = "checkpoint or run's folder (default: the bundled weights); with --suite, NAME=PATH of several"
     add("--weights", nargs="+", metavar="[NAME=]PATH", help=weights)
     suites = "tables of several methods, written beside --out (docs/network.md); a killed one goes on"
     add("--suite", choices=(*SUITES, "all"), help=suites)
     add("--scenes", default="", help="only scenes whose name begins so")
     add("--out", type=Path, default=Path("results.json"), help="default: results.json")
     add("--split", choices=("train", "val", "test"), default="test", help="default: test")
-    add(
-        "--frames",
-        type=_not_negative,
-        help="frames of every view; 0 takes all (default: 1, with --suite all)",
-    )
+    add("--frames", type=_not_negative, help="of every view; 0 takes all (default: 1, with --suite all)")
     _device(parser)
 
 
@@ -231,9 +213,7 @@ def _configure_predict(parser: argparse.ArgumentParser) -> None:
     add("--view", type=int, default=0, help="of a shard (default: 0)")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--frame", type=int, default=0, help="of the burst (default: 0)")
-    which.add_argument(
-        "--average", action="store_true", help="take the mean of the burst instead of one frame"
-    )
+    which.add_argument("--average", action="store_true", help="take the mean of the burst instead")
     add("--rig", type=Path, help="rig.toml for an array (default: nominal intrinsics)")
     saturation = "at which the sensor of an array saturates (default: 4095, 12 bits)"
     add("--saturation", type=_positive, metavar="COUNTS", help=saturation)
@@ -272,9 +252,8 @@ def _told(result: dict[str, Any], out: Path, device: str) -> str:
     if not errors:
         lines.append(f"no expected error: {result['network']} predicts none")
     if result["filled"]:
-        lines.append(
-            f"{result['measured']:.1%} of the pixels were measured, the others filled (measured.npy says which)"
-        )
+        share = f"{result['measured']:.1%} of the pixels were measured"
+        lines.append(f"{share}, the others filled (measured.npy says which)")
     if result["assumed"]:
         lines.append(f"assumed: {result['assumed']}; --rig brings those of your camera")
     return "\n".join(lines)
@@ -300,17 +279,17 @@ def _export(args: argparse.Namespace) -> Outcome:
     out = args.out or beside.with_suffix(SUFFIX[args.format])
     result = export(args.weights, out, kind=args.format, size=(args.size[0], args.size[1]))
     worst = max(result["differences"].values())
-    return Outcome(
-        result, f"{out}: {result['bytes'] / 1e6:.1f} MB, differs from torch by {worst:.1g} at most"
-    )
+    size = f"{result['bytes'] / 1e6:.1f} MB"
+    return Outcome(result, f"{out}: {size}, differs from torch by {worst:.1g} at most")
 
 
 def _configure_report(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--dataset", type=Path, help="folder that build-dataset wrote")
-    parser.add_argument("--results", type=Path, help="results.json of evaluate")
-    parser.add_argument("--evidence", type=Path, help="evidence.json of align")
-    parser.add_argument("--weights", type=Path, help=_WEIGHTS)
-    parser.add_argument("--out", type=Path, default=Path("report.html"), help="default: report.html")
+    add = parser.add_argument
+    add("--dataset", type=Path, help="folder that build-dataset wrote")
+    add("--results", type=Path, help="results.json of evaluate")
+    add("--evidence", type=Path, help="evidence.json of align")
+    add("--weights", type=Path, help=_WEIGHTS)
+    add("--out", type=Path, default=Path("report.html"), help="default: report.html")
 
 
 def _report(args: argparse.Namespace) -> Outcome:

@@ -19,10 +19,8 @@ from tofcapture.errors import ConfigError
 STAGES = ("depth", "normal", "refine", "joint")
 OURS, BASELINES = ("paper", "compact"), ("su2018", "guo2018", "coarse-fine")
 SOURCES = {"raw": 8, "confidence": 1, "depth": 1}
-_RETIRED = {
-    "chamfer_softness": 0.0,
-    "chamfer_distance": "point",
-}  # keys of old checkpoints, by what they had to be
+# keys of old checkpoints, by what they had to be
+_RETIRED = {"chamfer_softness": 0.0, "chamfer_distance": "point"}
 
 
 def _require(fine: bool, where: str, expected: str, got: object) -> None:
@@ -40,34 +38,19 @@ def _require_one(known: tuple[str, ...], where: str, got: str) -> None:
 class Network:
     """Which network.
 
-    Attributes
-    ----------
-    kind
-        ``paper``: three U-Nets; ``compact``: one small U-Net with three heads on classical features; ``su2018``, ``guo2018``,
-        ``coarse-fine``: published networks, of which ``su2018`` has a width and none has any of the other keys.
-    width, levels
-        Channels of the first level and number of levels of every U-Net.
-    inputs
-        What the paper's networks read, of ``raw``, ``confidence``, ``depth`` (paper, table IV).
-    windows
-        Radii in pixels of the side-window plane fits that ``compact`` reads.
-    max_residual
-        Metres by which the network may move a depth beyond its candidates; 0: any distance.
-    learned_upsampling
-        Depth by learned convex x2 upsampling; false: bilinear.
-    refine_iterations, refine_radius
-        Depth-normal-depth rounds, and taps to each side of the propagation window at twice the resolution.
+    ``paper`` is three U-Nets, ``compact`` one small U-Net with three heads on classical features. ``su2018``, ``guo2018`` and
+    ``coarse-fine`` are published networks, of which ``su2018`` has a width and none has any of the other keys.
     """
 
     kind: str = "paper"
-    width: int = 64
-    levels: int = 5
-    inputs: tuple[str, ...] = ("raw", "confidence", "depth")
-    windows: tuple[int, ...] = (2, 4)
-    max_residual: float = 0.0
-    learned_upsampling: bool = True
-    refine_iterations: int = 2
-    refine_radius: int = 2
+    width: int = 64  #: channels of the first level of every U-Net
+    levels: int = 5  #: of every U-Net
+    inputs: tuple[str, ...] = ("raw", "confidence", "depth")  #: of the paper's networks (table IV)
+    windows: tuple[int, ...] = (2, 4)  #: radii, px, of the side-window plane fits that compact reads
+    max_residual: float = 0.0  #: m that a depth may move beyond its candidates; 0: any distance
+    learned_upsampling: bool = True  #: of depth, convex x2; false: bilinear
+    refine_iterations: int = 2  #: rounds of depth to normals to depth
+    refine_radius: int = 2  #: taps to each side of the propagation window at twice the resolution
 
     def __post_init__(self) -> None:
         kinds, sources, compact = OURS + BASELINES, set(self.inputs), self.kind == "compact"
@@ -87,37 +70,20 @@ class Network:
 
 @dataclass(frozen=True)
 class Losses:
-    """Weights and constants of the losses.
+    """Weights and constants of the losses."""
 
-    Attributes
-    ----------
-    delta
-        Metres, threshold of eq. 1.
-    jitter
-        Metres, of the robust Chamfer loss (eq. 2).
-    reweight
-        Whether eq. 1 weighs pixels by lambda; false: plain smooth l1.
-    uncertainty
-        What the error map learns: ``l1``, the expected absolute error (paper), or ``laplace``, a Laplace distribution's scale,
-        which is then calibrated on the ``val`` split to be one sigma.
-    normals
-        Distance of normals: ``cosine``, eq. 3 (paper), or ``angle``, whose gradient does not fade with the angle.
-    depth, chamfer, error, normal
-        Weights of eq. 1, eq. 2 (in 1/mm^2), the error map, the normals.
-    context
-        Weight of measured surface outside the object crop relative to the object.
-    """
-
-    delta: float = 0.020
-    jitter: float = 0.010
-    reweight: bool = True
+    delta: float = 0.020  #: m, threshold of eq. 1
+    jitter: float = 0.010  #: m, of the robust Chamfer loss (eq. 2)
+    reweight: bool = True  #: whether eq. 1 weighs pixels by lambda; false: plain smooth l1
+    #: what the error map learns: l1, the expected absolute error (paper), or laplace, a Laplace distribution's scale,
+    #: which is then calibrated on the val split to be one sigma
     uncertainty: str = "l1"
-    normals: str = "cosine"
-    depth: float = 1.0
-    chamfer: float = 0.01
-    error: float = 1.0
-    normal: float = 1.0
-    context: float = 0.0
+    normals: str = "cosine"  #: eq. 3 (paper), or angle, whose gradient does not fade with the angle
+    depth: float = 1.0  #: weight of eq. 1
+    chamfer: float = 0.01  #: weight of eq. 2, 1/mm^2
+    error: float = 1.0  #: weight of the error map
+    normal: float = 1.0  #: weight of the normals
+    context: float = 0.0  #: weight of measured surface outside the object crop relative to the object
 
     def __post_init__(self) -> None:
         fine = self.delta > 0 and self.jitter >= 0
@@ -145,46 +111,22 @@ class Stage:
 
 @dataclass(frozen=True)
 class Training:
-    """How to train.
+    """How to train."""
 
-    Attributes
-    ----------
-    batch
-        Frames per step and process.
-    crop
-        (height, width) of training crops at sensor resolution; () takes whole frames.
-    frames
-        Use the first so many frames of every view; 0: all. Frames of a view differ in noise only, and each is decoded once.
-    noise
-        ``recorded``: frames as they were taken; ``drawn``: the mean of each view's frames with fresh shot and read noise, so
-        that no frame is ever seen twice.
-    phase_error
-        Radians; above 0 every crop is given an error of calibration of its own, as another camera of the make would have.
-    flip
-        Mirror frames at random: right as far as the light source stands near the lens.
-    schedule
-        ``constant`` (paper) or ``cosine`` down to zero over each stage.
-    validate_every
-        Epochs between validations, and one at the end of each stage; 0: none.
-    precision
-        ``float32``, or ``bfloat16`` for the convolutions; geometry and losses stay in float32. For GPUs with tensor cores.
-    compile
-        Compile the U-Nets (``torch.compile``): a minute or so at the start, and somewhat faster steps after.
-    seed
-        Of weights, order and crops.
-    """
-
-    batch: int = 4
-    crop: tuple[int, ...] = ()
-    frames: int = 0
+    batch: int = 4  #: frames per step and process
+    crop: tuple[int, ...] = ()  #: (height, width) at sensor resolution; () takes whole frames
+    frames: int = 0  #: use the first so many of every view, which differ in noise only; 0: all
+    #: recorded: frames as they were taken; drawn: the mean of each view's frames with fresh noise, so that none is seen twice
     noise: str = "recorded"
-    phase_error: float = 0.0
-    flip: bool = False
-    schedule: str = "constant"
-    validate_every: int = 0
-    precision: str = "float32"
-    compile: bool = False
-    seed: int = 0
+    phase_error: float = (
+        0.0  #: rad; above 0 every crop gets the calibration error of another camera of the make
+    )
+    flip: bool = False  #: mirror at random: right as far as the light source stands near the lens
+    schedule: str = "constant"  #: (paper) or cosine, down to zero over each stage
+    validate_every: int = 0  #: epochs between validations, and one at the end of each stage; 0: none
+    precision: str = "float32"  #: or bfloat16, of the convolutions, for GPUs with tensor cores
+    compile: bool = False  #: the U-Nets (torch.compile): a minute at the start, somewhat faster steps after
+    seed: int = 0  #: of weights, order and crops
 
     def __post_init__(self) -> None:
         _require(self.batch > 0, "training.batch", "> 0", self.batch)

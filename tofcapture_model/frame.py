@@ -14,42 +14,18 @@ MIN_RANGE, MAX_RANGE = 0.05, 5.0
 
 
 class Frame(NamedTuple):
-    """One ToF frame per batch item, float32.
+    """One ToF frame per batch item, float32."""
 
-    Attributes
-    ----------
-    raw
-        (B, K, H, W) raw channels in units of the sensor's saturation value.
-    phasor
-        (B, 4, H, W) I and Q of the low, then of the high frequency, in the same unit.
-    depth
-        (B, 1, H, W) decoded depth (z), metres; holes carry their nearest measured neighbour.
-    valid
-        (B, 1, H, W) 1 where ``depth`` was measured, 0 where it was filled.
-    confidence
-        (B, 1, H, W) amplitude of the high frequency in units of the saturation value.
-    gap
-        (B, 1, H, W) range of the low minus range of the high frequency, metres: the multipath cue.
-    cues
-        (B, 4, H, W) depth errors that physics expects, metres: :func:`tofcapture_model.geometry.multipath.cues`.
-    modulation
-        (B, 2) low and high modulation frequency, Hz.
-    intrinsics
-        (B, 4 or 9) of the (H, W) grid, pixels: :mod:`tofcapture_model.geometry.intrinsics`.
-    demodulation
-        (B, 4, K) weights that turn taps into ``phasor``.
-    """
-
-    raw: Tensor
-    phasor: Tensor
-    depth: Tensor
-    valid: Tensor
-    confidence: Tensor
-    gap: Tensor
-    cues: Tensor
-    modulation: Tensor
-    intrinsics: Tensor
-    demodulation: Tensor
+    raw: Tensor  #: (B, K, H, W) raw channels in units of the sensor's saturation value
+    phasor: Tensor  #: (B, 4, H, W) I and Q of the low, then of the high frequency, in the same unit
+    depth: Tensor  #: (B, 1, H, W) decoded depth (z), m; holes carry their nearest measured neighbour
+    valid: Tensor  #: (B, 1, H, W) 1 where depth was measured, 0 where it was filled
+    confidence: Tensor  #: (B, 1, H, W) amplitude of the high frequency in units of the saturation value
+    gap: Tensor  #: (B, 1, H, W) range of the low minus range of the high frequency, m: the multipath cue
+    cues: Tensor  #: (B, 4, H, W) depth errors that physics expects, m: geometry.multipath
+    modulation: Tensor  #: (B, 2) low and high modulation frequency, Hz
+    intrinsics: Tensor  #: (B, 4 or 9) of the (H, W) grid, px: geometry.intrinsics
+    demodulation: Tensor  #: (B, 4, K) weights that turn taps into phasor
 
 
 NO_MAPS = frozenset({"modulation", "intrinsics", "demodulation"})
@@ -57,42 +33,21 @@ NO_MAPS = frozenset({"modulation", "intrinsics", "demodulation"})
 
 
 class Target(NamedTuple):
-    """Ground truth at twice the resolution.
+    """Ground truth at twice the resolution."""
 
-    Attributes
-    ----------
-    depth
-        (B, 1, 2H, 2W) float32 metres; finite everywhere, meaningless outside ``good`` and ``context``.
-    normals
-        (B, 3, 2H, 2W) float32, unit, facing the camera.
-    good
-        (B, 1, 2H, 2W) bool: no mask bit is set; what metrics are taken over.
-    context
-        (B, 1, 2H, 2W) bool: measured surface outside the object crop; supervises, is never evaluated.
-    """
-
-    depth: Tensor
-    normals: Tensor
-    good: Tensor
-    context: Tensor
+    depth: Tensor  #: (B, 1, 2H, 2W) float32 m; finite everywhere, meaningless outside good and context
+    normals: Tensor  #: (B, 3, 2H, 2W) float32, unit, facing the camera
+    good: Tensor  #: (B, 1, 2H, 2W) bool: no mask bit is set; what metrics are taken over
+    context: Tensor  #: (B, 1, 2H, 2W) bool: measured surface outside the object crop; never evaluated
 
 
 class Estimate(NamedTuple):
-    """What a model answers, float32 at twice the resolution.
+    """What a model answers, float32 at twice the resolution, after and before refinement."""
 
-    Attributes
-    ----------
-    depth, normals
-        (B, 1, 2H, 2W) metres and (B, 3, 2H, 2W) unit camera-facing, after refinement.
-    error
-        (B, 1, 2H, 2W) metres, positive. With ``losses.uncertainty`` ``l1`` (paper) the expected absolute error of the depth;
-        with ``laplace`` (compact) one sigma, within which 68 % of the errors should be.
-    initial_depth, initial_normals
-        The same before refinement.
-    """
-
-    depth: Tensor
-    normals: Tensor
+    depth: Tensor  #: (B, 1, 2H, 2W) m
+    normals: Tensor  #: (B, 3, 2H, 2W) unit, facing the camera
+    #: (B, 1, 2H, 2W) m, positive: the expected absolute error of the depth (losses.uncertainty = l1, paper), or one sigma,
+    #: within which 68 % of the errors should be (laplace, compact)
     error: Tensor
     initial_depth: Tensor
     initial_normals: Tensor

@@ -80,18 +80,8 @@ def make_frame(
 ) -> Frame:
     """Decode one raw frame into what a network reads, as tensors without a batch axis.
 
-    Parameters
-    ----------
-    raw
-        (K, H, W) as the sensor gave it, or the mean of some frames.
-    info
-        Channel order, saturation, light source, range errors.
-    camera
-        Intrinsics of the ToF camera.
-    celsius
-        Sensor temperature; NaN: unknown.
-    decoder
-        :func:`frame_decoder` of the same camera; ``None`` builds its tables anew, which takes as long as some frames.
+    ``raw`` (K, H, W) is as the sensor gave it, or the mean of some frames; ``celsius`` is NaN where unknown. ``decoder`` is a
+    :func:`frame_decoder` of the same camera; ``None`` builds its tables anew, which takes as long as some frames.
     """
     maps, signals = (decoder or frame_decoder(info, camera)).signals(raw, celsius)
     depth, hz = maps.depth, frequencies(info.modulation_hz)
@@ -159,10 +149,7 @@ def mirror(frame: Frame, target: Target, axis: int = -1) -> tuple[Frame, Target]
 def open_scenes(folder: Path, split: str, cache: Path | None = None) -> dict[str, Reader]:
     """Open a split's scenes, by name: shards, or a cache that must still agree with them. Readers pickle as paths.
 
-    Raises
-    ------
-    DataError
-        The manifest or the cache is missing or damaged, the cache is stale or of another split.
+    :class:`DataError`: the manifest or the cache is missing, damaged, stale or of another split.
     """
     entries = load_manifest(folder).split(split)
     if cache is None:
@@ -176,17 +163,15 @@ def open_scenes(folder: Path, split: str, cache: Path | None = None) -> dict[str
 
 
 class FrameDataset(Dataset[tuple[Frame, Target]]):
-    """All frames of a split of a dataset.
+    """All frames of a split of a dataset, or of several.
 
     An item is asked for by ``(epoch, i)``: crop and flip are drawn from ``(seed, epoch, i)``. So an interrupted run goes on with
     the very same samples, whatever the number of workers.
 
     Parameters
     ----------
-    folder
-        The dataset, or several.
-    split
-        ``train``, ``val`` or ``test``.
+    folder, split
+        The dataset or datasets, and ``train``, ``val`` or ``test``.
     size
         (height, width) of crops at sensor resolution; () gives whole frames.
     flip

@@ -19,39 +19,18 @@ _ORDERS = (0, 2, 4)  # of the phase: offset, and the wiggling of sensors with fo
 
 
 class BurstNoise(NamedTuple):
-    """What it takes to draw the noise of a frame anew.
+    """What it takes to draw the noise of a frame anew."""
 
-    Attributes
-    ----------
-    averaged
-        Frames that a given one is the mean of; ``inf``: it has no noise.
-    noise
-        Of one tap of one frame.
-    full_scale
-        Raw value of saturation.
-    """
-
-    averaged: float
-    noise: TapNoise
-    full_scale: float
+    averaged: float  #: frames that a given one is the mean of
+    noise: TapNoise  #: of one tap of one frame
+    full_scale: float  #: raw value of saturation
 
 
 def redraw_noise(taps: Tensor, generator: torch.Generator, burst: BurstNoise) -> Tensor:
-    """Draw one more frame of a static burst: shot and read noise from the taps' own values.
+    """Draw one more frame of a static burst: shot and read noise from the taps' own values, (..., K, H, W) raw units.
 
-    The mean brings a part of the noise along, ``1 / averaged`` of the variance; the rest is drawn. Taps are rounded and clipped
-    as a sensor does. What was saturated stays so.
-
-    Parameters
-    ----------
-    taps
-        (..., K, H, W), the mean of ``burst.averaged`` frames, raw units.
-    generator
-        Of the device that ``taps`` are on.
-
-    Returns
-    -------
-    float32 of whole numbers, shaped like ``taps``.
+    The mean brings ``1 / averaged`` of the variance along; the rest is drawn. Taps are rounded and clipped as a sensor does, and
+    what was saturated stays so. The generator is of the taps' device.
     """
     taps = taps.to(torch.float32)
     variance = taps.clamp(min=0) / burst.noise.electrons_per_unit + burst.noise.read**2
@@ -64,15 +43,8 @@ def redraw_noise(taps: Tensor, generator: torch.Generator, burst: BurstNoise) ->
 def redraw_frame(frame: Frame, generator: torch.Generator, burst: BurstNoise) -> Frame:
     """Draw one more frame of a static burst, decoded: fresh noise on the taps, phasors, depth, confidence and gap.
 
-    The turn of each phasor moves the range of its frequency, so calibration and wraps stay those of the mean. Cues stay, too,
-    as they are smooth. Holes keep their filling.
-
-    Parameters
-    ----------
-    frame
-        Decoded from the mean of ``burst.averaged`` frames; (B, ., H, W).
-    generator
-        Of the frame's device.
+    ``frame`` (B, ., H, W) is decoded from the mean of ``burst.averaged`` frames. The turn of each phasor moves the range of its
+    frequency, so calibration and wraps stay. Cues stay, too, as they are smooth. Holes keep their filling.
     """
     raw = redraw_noise(frame.raw * burst.full_scale, generator, burst) / burst.full_scale
     phasor = torch.einsum("bck,bkhw->bchw", frame.demodulation, raw)
@@ -87,19 +59,8 @@ def redraw_calibration(frame: Frame, generator: torch.Generator, radians: float)
 
     A part of each frequency's systematic error is never known: ``sum_m (a_m cos m phi + b_m sin m phi)`` over the measured phase
     phi, m = 0, 2, 4, as :class:`tofcapture.rig.RangeError` writes it. Drawn anew, no network learns a few cameras by heart.
-
-    Parameters
-    ----------
-    frame
-        (B, ., H, W).
-    generator
-        Of the frame's device.
-    radians
-        Standard deviation of each amplitude, as phase; a camera's error varies by ``sqrt(3)`` times this.
-
-    Returns
-    -------
-    A frame of which depth, gap and the cue of the gap have moved; raw, phasors and confidence are what was measured.
+    ``radians`` is the standard deviation of each amplitude; a camera's error varies by ``sqrt(3)`` times this. Depth, gap and the
+    gap's cue move; raw, phasors and confidence are what was measured.
     """
     low, high = (_drawn_error(frame, which, generator) * radians for which in (0, 1))
     moved = _moved(frame, low, high)

@@ -46,29 +46,15 @@ _HARMONIC, _AGREEMENT, _WITHIN = 0.3, 0.5, 0.5
 
 @dataclass(frozen=True)
 class RawInput:
-    """A burst and what is needed to decode it.
+    """A burst of F frames and what is needed to decode it."""
 
-    Attributes
-    ----------
-    raw, celsius
-        (F, K, H, W) taps of all frames; (F,) sensor temperatures, NaN: unknown.
-    info, camera
-        Channels, saturation, light source, range errors; intrinsics.
-    source
-        The file, for messages.
-    assumed
-        What was taken for granted because nobody said it; empty: nothing.
-    warning
-        What looks wrong and may be right; empty: nothing.
-    """
-
-    raw: NDArray[Any]
-    celsius: NDArray[np.float64]
-    info: TofInfo
-    camera: Camera
-    source: str = ""
-    assumed: str = ""
-    warning: str = ""
+    raw: NDArray[Any]  #: (F, K, H, W) taps
+    celsius: NDArray[np.float64]  #: (F,) sensor temperatures; NaN: unknown
+    info: TofInfo  #: channels, saturation, light source, range errors
+    camera: Camera  #: intrinsics
+    source: str = ""  #: the file, for messages
+    assumed: str = ""  #: what was taken for granted because nobody said it
+    warning: str = ""  #: what looks wrong and may be right
 
     def named(self, frame: int | None) -> str:
         """Call a frame, or with ``None`` the mean of all, by name."""
@@ -84,24 +70,10 @@ def _which(raw: NDArray[Any], frame: int | None) -> str:
 def taken(
     raw: NDArray[Any], frame: int | None, saturation: float, celsius: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Take one frame (K, H, W) of a burst, or with ``frame = None`` the mean, and its sensor temperature.
+    """Take one frame (K, H, W) of a burst (F, K, H, W), or with ``None`` the mean, and its sensor temperature of (F,).
 
     A tap that is saturated in any frame gets the saturation value in the mean: clipping took from its mean what nobody knows.
-    :meth:`tofcapture.ops.phase.Decoder.burst` has the same rule.
-
-    Parameters
-    ----------
-    raw, celsius
-        (F, K, H, W) taps, (F,) sensor temperatures.
-    frame
-        0 to F - 1, or ``None``.
-    saturation
-        Raw value from which a tap is saturated.
-
-    Raises
-    ------
-    ConfigError
-        No such frame.
+    :meth:`tofcapture.ops.phase.Decoder.burst` has the same rule. :class:`ConfigError`: no such frame.
     """
     if frame is not None:
         if not 0 <= frame < len(raw):
@@ -129,10 +101,9 @@ def read_input(
         ``raw``: counts in the order of :data:`CHANNELS`.
     view
         Of a shard.
-    rig
-        ``rig.toml`` for an array; without it, nominal values, which ``assumed`` names.
-    saturation
-        Counts at which the sensor of an array saturates; ``None``: :data:`SATURATION`.
+    rig, saturation
+        Of an array: its ``rig.toml``, and the counts at which its sensor saturates. Without them nominal values are taken, and
+        ``assumed`` names them.
     frame
         Of an array, what is looked at: one frame, or ``None``: the mean.
 
@@ -230,13 +201,7 @@ def _check_shape(raw: NDArray[Any], camera: Camera, path: Path) -> None:
 
 
 def expect_finite(raw: NDArray[Any], where: str) -> None:
-    """Refuse taps that are NaN or infinite: a network would spread them over the whole image.
-
-    Raises
-    ------
-    DataError
-        Some are.
-    """
+    """Refuse taps that are NaN or infinite with a :class:`DataError`: a network would spread them over the whole image."""
     if not (finite := np.isfinite(raw)).all():
         raise DataError(
             f"{where}: expected finite numbers, got {np.count_nonzero(~finite)} others",

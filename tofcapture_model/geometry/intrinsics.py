@@ -25,13 +25,7 @@ def intrinsics_of(camera: Camera) -> Tensor:
 
 
 def expect_usable(camera: Camera) -> None:
-    """Refuse a lens whose rays the networks would get wrong, at the sensor's resolution or at twice that.
-
-    Raises
-    ------
-    ConfigError
-        The lens folds, or nearly so, at the image's border.
-    """
+    """Refuse a lens whose rays the networks would get wrong, at the sensor's resolution or at twice that, as it folds at the border."""
     if not camera.distortion:
         return
     for scale in (1, 2):

@@ -86,14 +86,8 @@ def _moments(images: Tensor, radius: int) -> Tensor:
 def local_planes(depth: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Tensor]:
     """Fit inverse depth linearly in every window: a plane is linear in inverse depth, ``n . r = 1 / z``.
 
-    Parameters
-    ----------
-    depth
-        (B, 1, H, W) metres, positive and finite everywhere.
-    valid
-        (B, 1, H, W) weight of every pixel, 0 for holes.
-    radius
-        Window of ``2 radius + 1`` pixels.
+    ``depth`` (B, 1, H, W), metres, is positive and finite everywhere; ``valid`` (B, 1, H, W) weighs pixels, 0 for holes. A window
+    has ``2 radius + 1`` pixels.
 
     Returns
     -------
@@ -144,22 +138,13 @@ def side_window_planes(
 ) -> tuple[Tensor, Tensor]:
     """Fit planes that do not reach across edges: side-window filtering with planes instead of means.
 
-    Nine windows explain a pixel: the one centred on it and the eight that touch it with a side or a corner. Those that fit
-    badly, as they hold an edge, count little.
-
-    Parameters
-    ----------
-    depth, valid
-        As in :func:`local_planes`.
-    radius
-        Of each window.
-    floor
-        Standard deviation, 1/m, below which residuals are equal.
+    Nine windows explain a pixel: the one centred on it and the eight that touch it with a side or a corner. Those that fit badly,
+    as they hold an edge, count little; below a standard deviation of ``floor``, 1/m, residuals are equal.
 
     Returns
     -------
     coefficients
-        (B, 3, H, W) as in :func:`local_planes`, at the pixel itself.
+        (B, 3, H, W) as of :func:`local_planes`, at the pixel itself.
     variance
         (B, 1, H, W) of the best window.
     """
@@ -192,24 +177,8 @@ def propagate_depth(
     """Move every depth towards the tangent planes of its neighbours (GeoNet's normal-to-depth kernel regression).
 
     Neighbour j votes ``z_ji = z_j (n_j . r_j) / (n_j . r_i)`` for pixel i with weight ``n_j . n_i`` where that is above
-    ``alpha``. Votes further than ``max_jump`` from the present depth are dropped.
-
-    Parameters
-    ----------
-    depth, normals, confidence
-        (B, 1, H, W) metres, (B, 3, H, W) unit, (B, 1, H, W) positive weight of each pixel as a voter.
-    intrinsics
-        (B, 4 or 9).
-    radius, step
-        Window in taps to each side, and pixels between taps.
-    alpha
-        Cosine of the largest angle between normals that vote for each other.
-    max_jump
-        Metres.
-
-    Returns
-    -------
-    (B, 1, H, W) metres
+    ``alpha``. Votes further than ``max_jump``, metres, from the present depth are dropped. Neighbours are ``radius`` taps to each
+    side, ``step`` pixels apart, and count by their ``confidence`` (B, 1, H, W). Returns (B, 1, H, W) metres.
     """
     r = rays(intrinsics, *depth.shape[-2:])
     plane = (normals * r).sum(1, keepdim=True) * depth  # n . p, the plane's distance

@@ -33,10 +33,8 @@ def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: 
         (B, 4, H, W) I and Q of the low, then of the high frequency, units of saturation.
     depth, valid, gap
         (B, 1, H, W) decoded depth and its weight; range of the low minus range of the high frequency; metres.
-    intrinsics
-        (B, 4 or 9).
-    hz
-        High modulation frequency.
+    intrinsics, hz
+        (B, 4 or 9), and the high modulation frequency.
 
     Returns
     -------
@@ -105,16 +103,8 @@ def exchange_error(
     amplitudes and one constant of the sensor. The error is the angle of ``1 + (K x)_p / E_p``, in which the patch's own albedo
     cancels. Occlusion between patches and what lies out of sight are not in it.
 
-    Parameters
-    ----------
-    surfaces
-        (B, 5, H, W), see :func:`surface`.
-    intrinsics, hz
-        (B, 4 or 9), and the modulation frequency.
-    step
-        Pixels per patch; time goes with its inverse fourth power.
-    margin
-        Patches that are added beyond each border on the planes of the border: the table does not end where the image does.
+    ``surfaces`` (B, 5, H, W) are those of :func:`surface`. A patch has ``step`` pixels; time goes with their inverse fourth power.
+    ``margin`` patches are added beyond each border, on its planes: the table does not end where the image does.
 
     Returns
     -------

@@ -54,20 +54,10 @@ def smooth_l1(difference: Tensor, delta: float) -> Tensor:
 def reweighted_smooth_l1(
     depth: Tensor, gt: Tensor, error: Tensor, mask: Tensor, delta: float = DELTA
 ) -> Tensor:
-    """Compute the reweighted smooth l1 loss (eq. 1), mean over the mask.
+    """Compute the reweighted smooth l1 loss (eq. 1), mean over the mask; a scalar without unit.
 
-    Parameters
-    ----------
-    depth, gt, error
-        (B, 1, H, W) metres: prediction, ground truth, expected absolute error of the prediction.
-    mask
-        (B, 1, H, W) bool, or a weight per pixel; 0 takes no part.
-    delta
-        Metres.
-
-    Returns
-    -------
-    Scalar without unit; scaling all lengths by k, delta included, leaves it unchanged.
+    ``depth``, ``gt`` and ``error``, the expected absolute error, are (B, 1, H, W) metres; ``mask`` is bool, or a weight per pixel.
+    Scaling all lengths by k, delta included, leaves it unchanged.
     """
     gt = _inside(gt, mask, depth)
     weight = reweighting(gt, error.float(), mask)
@@ -97,10 +87,7 @@ def cosine_loss(normals: Tensor, gt: Tensor, mask: Tensor) -> Tensor:
 
 
 def angle_loss(normals: Tensor, gt: Tensor, mask: Tensor) -> Tensor:
-    """Average the chord ``|n1 - n2|`` of unit normals over the mask: the angle in radians where it is small.
-
-    Eq. 3 is half its square, which hardly pulls at a few degrees.
-    """
+    """Average the chord ``|n1 - n2|`` of unit normals over the mask: about the angle, where eq. 3, half its square, hardly pulls."""
     apart = unit(normals.float()) - unit(_inside(gt, mask, normals))
     return masked_mean((apart.square().sum(1, keepdim=True) + _SMALL_CHORD**2).sqrt() - _SMALL_CHORD, mask)
 

@@ -43,13 +43,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a safetensors file and its header.
-
-    Raises
-    ------
-    FormatError
-        Missing, damaged, or not safetensors.
-    """
+    """Read a safetensors file and its header; :class:`FormatError` where it is missing, damaged, or something else."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -69,18 +63,9 @@ def save_model(
     *,
     precision: Literal["float32", "float16"] = "float32",
 ) -> Path:
-    """Write weights and configuration.
+    """Write weights, configuration and provenance, any JSON object, to a ``.safetensors``; the configuration also beside it as ``.toml``.
 
-    Parameters
-    ----------
-    path
-        ``.safetensors``; the configuration is written beside it as ``.toml``.
-    model, config
-        What was trained, and as what.
-    provenance
-        Any JSON object (dataset digests, steps, metrics).
-    precision
-        ``float16`` halves the file and rounds every weight to 11 bits; :func:`load_model` computes in float32 all the same.
+    ``float16`` halves the file and rounds every weight to 11 bits; :func:`load_model` computes in float32 all the same.
 
     Raises
     ------
@@ -119,12 +104,7 @@ def find_model(path: str | Path | None) -> Path:
 
 
 def load_model(path: str | Path | None = None) -> tuple[Model, Config, dict[str, Any]]:
-    """Load a model, strictly: a missing or an additional weight is an error. It computes in float32, however it was stored.
-
-    Parameters
-    ----------
-    path
-        File, run folder, or ``None`` or ``bundled`` for the bundled weights.
+    """Load a file, a run's folder or, with ``None`` or ``bundled``, the bundled weights; strictly, and to compute in float32.
 
     Returns
     -------
@@ -166,14 +146,7 @@ def origin(provenance: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def learned_from(datasets: Sequence[Path], before: Learned | None = None) -> dict[str, list[str]]:
-    """Collect what a checkpoint remembers of the ``train`` splits of datasets.
-
-    Parameters
-    ----------
-    datasets
-        Folders.
-    before
-        What the weights knew that training started from.
+    """Collect what a checkpoint remembers of the ``train`` splits of datasets, and of the weights that it started from.
 
     Returns
     -------
@@ -188,14 +161,7 @@ def learned_from(datasets: Sequence[Path], before: Learned | None = None) -> dic
 
 
 def not_new(provenance: Mapping[str, Any], dataset: Path, split: str) -> dict[str, str] | None:
-    """Find the scenes of a split that a network has learned from.
-
-    Parameters
-    ----------
-    provenance
-        Of its checkpoint.
-    dataset, split
-        What it is evaluated on.
+    """Find the scenes of a split that a network has learned from, by the provenance of its checkpoint.
 
     Returns
     -------

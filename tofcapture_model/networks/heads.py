@@ -48,24 +48,12 @@ _GAIN_UNIT = 5.0  # gains learn at the pace of the weights of a layer, which mov
 
 
 class Features(NamedTuple):
-    """What the heads read.
+    """What the heads read."""
 
-    Attributes
-    ----------
-    image
-        (B, C, H, W) for the convolutions, about unit scale.
-    candidates
-        (B, K, H, W) classically denoised or corrected depths, metres; K may be 0.
-    normals
-        (B, 3, H, W) unit normals to start from.
-    rays
-        (B, 3, H, W) of the sensor's pixels, z = 1; a lens takes some time to invert.
-    """
-
-    image: Tensor
-    candidates: Tensor
-    normals: Tensor
-    rays: Tensor
+    image: Tensor  #: (B, C, H, W) for the convolutions, about unit scale
+    candidates: Tensor  #: (B, K, H, W) classically denoised or corrected depths, m; K may be 0
+    normals: Tensor  #: (B, 3, H, W) unit normals to start from
+    rays: Tensor  #: (B, 3, H, W) of the sensor's pixels, z = 1; a lens takes some time to invert
 
 
 class PaperInputs(nn.Module):
@@ -145,16 +133,8 @@ def _planes(image: Tensor) -> Tensor:
 class Raw2Depth(nn.Module):
     """Decoded depth + gated steps to its candidates + residual, then convex upsampling.
 
-    Parameters
-    ----------
-    net
-        Maps the shared image to ``candidates + 1 + CONVEX_CHANNELS`` channels.
-    network
-        ``max_residual`` and ``learned_upsampling`` of it count.
-    candidates
-        Depths that are stepped to.
-    decoded
-        Whether the answer is a correction of the decoded depth; without it, depth about ``MIDDLE``.
+    ``net`` maps the shared image to ``candidates + 1 + CONVEX_CHANNELS`` channels. Where the network does not see the decoded
+    depth, the answer is no correction of it but a depth about ``MIDDLE``.
     """
 
     def __init__(

@@ -36,18 +36,9 @@ class JointModel(nn.Module):
         raise NotImplementedError
 
     def forward(self, frame: Frame, stage: str = "joint") -> Estimate:
-        """Estimate depth, error map and normals.
+        """Estimate depth, error map and normals of a frame (B, ., H, W), any H and W, at (2H, 2W).
 
-        Parameters
-        ----------
-        frame
-            (B, ., H, W), any H and W.
-        stage
-            A training stage; ``depth`` and ``normal`` skip the networks that do not take part in it.
-
-        Returns
-        -------
-        Estimate, at (2H, 2W)
+        ``stage`` is one of training; ``depth`` and ``normal`` skip the networks that do not take part in it.
         """
         features, shared = self.read(frame)
         depth = doubled(frame.depth) if stage == "normal" else self.raw2depth(shared, features, frame)
@@ -58,8 +49,9 @@ class JointModel(nn.Module):
             normals = self.raw2normal(shared, features, depth, frame)
         if stage in ("depth", "normal"):
             return Estimate(depth, normals, error, depth, normals)
-        refined = self.refinement(depth, normals, error, scale_intrinsics(frame.intrinsics, 2))
-        return Estimate(*refined, error, depth, normals)
+        fine = scale_intrinsics(frame.intrinsics, 2)
+        fine_depth, fine_normals = self.refinement(depth, normals, error, fine)
+        return Estimate(fine_depth, fine_normals, error, depth, normals)
 
 
 class PaperModel(JointModel):

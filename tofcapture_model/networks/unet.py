@@ -32,20 +32,10 @@ def pad_to_multiple(image: Tensor, multiple: int) -> tuple[Tensor, tuple[int, in
 
 
 class UNet(nn.Module):
-    """U-Net of any base width and depth, He initialised.
+    """U-Net of any base width and number of levels, He initialised; every level doubles the width.
 
-    ``UNet(10, 1, 64)`` has the original's widths 64 ... 1024 and 31,035,777 parameters.
-
-    Parameters
-    ----------
-    inputs, outputs
-        Channels.
-    width
-        Channels of the first level; every level doubles it.
-    levels
-        Resolutions; 5 in the original.
-    zero_last
-        Start the last 1 x 1 convolution at zero: a residual network then begins as the identity.
+    ``UNet(10, 1, 64)`` has the original's widths 64 ... 1024 and 31,035,777 parameters. With ``zero_last`` the last 1 x 1
+    convolution starts at zero: a residual network then begins as the identity.
     """
 
     def __init__(

@@ -74,10 +74,7 @@ class Group(NamedTuple):
 def processes(device: str) -> Iterator[Group]:
     """Join the group that ``torchrun`` announces in the environment; on ``cuda`` each process takes a GPU of its own.
 
-    Raises
-    ------
-    ConfigError
-        More processes on this machine than GPUs.
+    :class:`ConfigError`: there are more processes on this machine than GPUs.
     """
     world, own = int(os.environ.get("WORLD_SIZE", "1")), torch.device(device)
     if own.type == "cuda":
@@ -106,26 +103,14 @@ def _own_gpu(device: torch.device, world: int) -> torch.device:
 
 @dataclass
 class Position:
-    """Where a run is; everything in it goes into the resume point.
+    """Where a run is; everything in it goes into the resume point."""
 
-    Attributes
-    ----------
-    stage, epoch, batch
-        The next batch to take.
-    step
-        Steps done, over all stages.
-    elapsed
-        Seconds of training in this stage, over all sittings.
-    before
-        Seconds of the stages before this one.
-    """
-
-    stage: int = 0
+    stage: int = 0  #: with epoch and batch: the next batch to take
     epoch: int = 0
     batch: int = 0
-    step: int = 0
-    elapsed: float = 0.0
-    before: float = 0.0
+    step: int = 0  #: steps done, over all stages
+    elapsed: float = 0.0  #: s of training in this stage, over all sittings
+    before: float = 0.0  #: s of the stages before this one
 
     def next_stage(self) -> None:
         """Go to the start of the next stage."""
@@ -191,25 +176,8 @@ class Trained:
 class Run:
     """A run in its folder: begun, or gone on with, in which case its weights are loaded into the model.
 
-    Parameters
-    ----------
-    config, model, group
-        What is trained, and by which processes.
-    dataset
-        Whose ``val`` split validates.
-    out
-        The run's folder.
-    source
-        What it is trained on and from: :func:`source_of`.
-    minutes
-        Budget of all stages together; ``None``: their epochs count.
-    report
-        Is told how far the run is.
-
-    Raises
-    ------
-    ConfigError
-        The folder holds another run.
+    It validates on the split ``val`` of ``dataset``; ``source`` is what it is trained on and from (:func:`source_of`). With
+    ``minutes`` these are shared by all stages, without them their epochs count. :class:`ConfigError`: the folder holds another run.
     """
 
     def __init__(
@@ -232,7 +200,7 @@ class Run:
             load_strictly(model, weights, out / "resume.safetensors")
         self.losses: dict[str, float] = state.pop("losses", {})
         self.position = Position(**state)
-        self._log = Log(None)
+        self._log, self._told = Log(None), (0.0, 1.0)  # done and all, of the stage
         self._started = self._saved = time.monotonic()
 
     def __enter__(self) -> Self:
@@ -253,8 +221,8 @@ class Run:
             )
             left = keys[position.batch :]
             for batch in DataLoader(data, batch_sampler=left, num_workers=workers, collate_fn=collate):
-                done, total = position.epoch * len(keys) + position.batch, stage.epochs * len(keys)
-                self._told: tuple[float, float] = (position.elapsed, budget) if budget else (done, total)
+                steps = position.epoch * len(keys) + position.batch, stage.epochs * len(keys)
+                self._told = (position.elapsed, budget) if budget else steps
                 self.progress = min(self._told[0] / self._told[1], 1.0)
                 yield batch
                 if budget is not None and position.elapsed >= budget:
@@ -365,13 +333,7 @@ def eagerly() -> AbstractContextManager[object]:
 
 
 def source_of(model: Model, config: Config, datasets: Sequence[Path], start: Path | None) -> dict[str, Any]:
-    """Name what a run is trained on and from; with ``start`` the model is given the weights of that checkpoint.
-
-    Raises
-    ------
-    ConfigError
-        The checkpoint is of another network.
-    """
+    """Name what a run is trained on and from; with ``start`` the model is given that checkpoint's weights, of the same network."""
     first, *also = datasets
     source: dict[str, Any] = {"dataset": str(first), "manifest_sha256": _digest(first)}
     known: dict[str, Any] | None = None

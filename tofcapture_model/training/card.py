@@ -32,22 +32,10 @@ def write_card(
     provenance: Mapping[str, Any],
     minutes: float | None = None,
 ) -> dict[str, Any]:
-    """Write ``OUT/README.md`` at the end of a run.
+    """Write ``OUT/README.md`` at the end of a run, from its ``metrics.jsonl`` and what else is known of it.
 
-    Parameters
-    ----------
-    out
-        Folder of the run; ``metrics.jsonl`` in it has the losses and validations.
-    config, model, dataset, device
-        What was trained, on what, where.
-    provenance
-        What is known of the run: ``steps``, ``minutes``, ``losses``, ``manifest_sha256``, where it started.
-    minutes
-        The budget that the run was given; ``None``: its epochs.
-
-    Returns
-    -------
-    What the checkpoint should remember besides: ``device``, ``torch``.
+    ``provenance`` has ``steps``, ``minutes``, ``losses``, ``manifest_sha256`` and where the run started; ``minutes`` is the budget
+    that it was given, ``None``: its epochs. Returns what the checkpoint should remember besides: ``device``, ``torch``.
     """
     facts = {"device": _device_name(device), "torch": torch.__version__}
     rows = read_metrics(out / "metrics.jsonl")

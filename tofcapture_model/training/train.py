@@ -124,17 +124,7 @@ def train(
 
 
 class Learner:
-    """The part of a model that learns in a stage, with its optimiser.
-
-    Parameters
-    ----------
-    model, config, stage
-        What is trained, and how.
-    group
-        The processes that train together.
-    moments
-        Adam's, of a run that goes on; empty at the start of a stage.
-    """
+    """The part of a model that learns in a stage, with its optimiser and, of a run that goes on, Adam's moments."""
 
     def __init__(
         self, model: Model, config: Config, stage: Stage, group: Group, moments: Moments | None = None

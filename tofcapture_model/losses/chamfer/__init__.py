@@ -21,21 +21,14 @@ JITTER = 0.010  # m, paper: 1 centimetre
 
 
 class Chamfer(NamedTuple):
-    """Result of :func:`robust_chamfer`.
+    """Result of :func:`robust_chamfer`."""
 
-    Attributes
-    ----------
-    loss
-        (B,) m^2: mean squared distance P -> Q plus Q -> P of the best candidate; 0 for items without points.
-    candidates
-        (B, 7) without gradient. Exact for the winner; of the others a bound from below that shows that they cannot win.
-    winner
-        (B,) int64 index into :func:`candidate_shifts`; worth logging, see docs/decisions/0005-network.md.
-    """
-
-    loss: Tensor
+    loss: (
+        Tensor  #: (B,) m^2: mean squared distance P -> Q plus Q -> P of the best candidate; 0 without points
+    )
+    #: (B, 7) without gradient; exact for the winner, of the others a bound from below that shows that they cannot win
     candidates: Tensor
-    winner: Tensor
+    winner: Tensor  #: (B,) int64 index into candidate_shifts; worth logging (docs/decisions/0005-network.md)
 
 
 def candidate_shifts(jitter: float = JITTER) -> Tensor:

@@ -44,7 +44,7 @@ def nearest_of_best(
             queries, points = own.flatten(1)[:, of_own], other.flatten(1)[:, of_other]
             found = [
                 ((some[:, :, None] - points[:, None]) + moved[:, None, None]).square().sum(0).min(1)
-                for some in queries.split(max(_AT_ONCE // len(of_other), 1), dim=1)
+                for some in torch.split(queries, max(_AT_ONCE // len(of_other), 1), dim=1)
             ]
             squared[k, way].view(-1)[of_own] = torch.cat([least for least, _ in found])
             index[k, way].view(-1)[of_own] = of_other[torch.cat([at for _, at in found])]

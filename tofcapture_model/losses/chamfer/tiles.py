@@ -34,7 +34,7 @@ def nearest_of_best(
     squared = torch.empty(shape, device=p.device)
     codes = torch.empty(shape, device=p.device, dtype=torch.int32)
     # Triton launches on the current GPU, whichever the tensors are on
-    with torch.cuda.device_of(points):  # type: ignore[no-untyped-call]
+    with torch.cuda.device_of(points):
         search[(tiles, 2 * len(shifts))](
             points, boxes, shifts.float().contiguous(), squared, codes, tiles,
             POINTS=POINTS, PART=PART, BLOCK=BLOCK, num_warps=1,
@@ -57,22 +57,10 @@ def search(
 ):
     """Find the nearest of P + s in Q (way 0) and of Q - s in P (way 1); grid (T, 2 S), whose second axis counts ``2 shift + way``.
 
-    Parameters
-    ----------
-    points
-        (2, T, 3, 64) float32, both clouds by tiles, metres; what is masked is at infinity.
-    boxes
-        (2, 6, T) float32, least and greatest coordinates of every tile's points; of none inf and -inf.
-    shifts
-        (S, 3) float32, metres.
-    squared
-        (S, 2, T, 64) float32, written: m^2, -1 where masked.
-    codes
-        (S, 2, T, 64) int32, written: 64 times the tile of the nearest, plus its place there.
-    tiles
-        T.
-    POINTS, PART, BLOCK
-        The module's; Triton takes constants as arguments.
+    ``points`` (2, T, 3, 64) float32, metres, are both clouds by tiles; what is masked is at infinity. ``boxes`` (2, 6, T) are the
+    least and greatest coordinates of every tile's points, of none inf and -inf; ``shifts`` (S, 3). Written are ``squared``
+    (S, 2, T, 64), m^2, -1 where masked, and ``codes`` int32: 64 times the tile of the nearest, plus its place there. POINTS, PART
+    and BLOCK are the module's; Triton takes constants as arguments.
     """
     tile, job = tl.program_id(0), tl.program_id(1)
     way = job % 2

@@ -65,12 +65,9 @@ def _boxes_near(boxes: Float32, g: int, p: Point, squared: np.float32) -> np.uin
 @compiled
 def _apart(leaves: Float32, g: int, k: int, p: Point, s: Point) -> np.float32:
     """Squared distance of a point of a leaf to p + s; the shift is taken from the difference, where it rounds least."""
-    dx, dy, dz = (
-        (leaves[g, 0, k] - p[0]) - s[0],
-        (leaves[g, 1, k] - p[1]) - s[1],
-        (leaves[g, 2, k] - p[2]) - s[2],
-    )
-    return dx * dx + dy * dy + dz * dz
+    dx, dy = (leaves[g, 0, k] - p[0]) - s[0], (leaves[g, 1, k] - p[1]) - s[1]
+    dz = (leaves[g, 2, k] - p[2]) - s[2]
+    return np.float32(dx * dx + dy * dy + dz * dz)
 
 
 @compiled
@@ -159,7 +156,9 @@ class _Tree:
             [leaves.amin(2), torch.where(leaves < torch.inf, -leaves, torch.inf).amin(2)], dim=1
         )
         corners = corners.T.reshape(6, h, w) - _MARGIN * largest
-        boxes, levels, start = [], [], 0
+        boxes: list[Tensor] = []
+        levels: list[tuple[int, int, int]] = []
+        start = 0
         while not levels or h * w > 1:
             boxes.append(tiles_of(corners, SIDE))
             width, h, w = w, -(-h // SIDE), -(-w // SIDE)
@@ -200,7 +199,8 @@ class _Shift:
 
     def shares(self) -> NDArray[np.float64]:
         """(2, L) parts of the symmetric mean squared distance, m^2; from below until everything was asked."""
-        return self.sums / np.array([[tree.count] for tree in self.trees])
+        found: NDArray[np.float64] = self.sums / np.array([[tree.count] for tree in self.trees])
+        return found
 
     def seen(self) -> float:
         """Symmetric mean squared distance, m^2; from below until everything was asked."""

@@ -40,14 +40,8 @@ def fine_normals(depth: Tensor, frame: Frame) -> Tensor:
 def sensor_estimate(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
     """Answer as the sensor does, without denoising: row one of the paper's table.
 
-    Returns
-    -------
-    depth
-        (B, 1, 2H, 2W) metres; holes carry their nearest measured neighbour, so that coverage is equal to the model's.
-    normals
-        (B, 3, 2H, 2W) unit.
-    measured
-        (B, 1, 2H, 2W) bool: not such a hole.
+    Returns depth (B, 1, 2H, 2W), metres, in which holes carry their nearest measured neighbour, so that coverage is equal to the
+    model's; unit normals (B, 3, 2H, 2W); and what was measured, (B, 1, 2H, 2W) bool.
     """
     depth = upsample_depth(frame.depth)
     measured = F.interpolate(frame.valid, scale_factor=2, mode="nearest") > 0
@@ -55,24 +49,12 @@ def sensor_estimate(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def decode(frame: Frame, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Decode a frame again with other phasors, differentiably: both frequencies, unwrapped and fused as the decoder does.
+    """Decode a frame again with other phasors (B, 2, H, W), differentiably: both frequencies, unwrapped and fused as the decoder does.
 
     Their turns move the ranges, so calibration stays that of the frame; the wrap is the one that leaves the smallest gap.
     Rounding has no gradient. Holes turn, but their wraps stay: no gap is known there.
 
-    Parameters
-    ----------
-    frame
-        Decoded from ``frame.phasor``.
-    low, high
-        (B, 2, H, W) phasors of the low and the high frequency.
-
-    Returns
-    -------
-    depth
-        (B, 1, H, W) metres, ``frame.depth`` where the phasors are the frame's.
-    gap
-        (B, 1, H, W) metres, range of the low minus range of the high frequency, within half a range of the high one but in holes.
+    Returns depth (B, 1, H, W), ``frame.depth`` where the phasors are the frame's, and the gap, both in metres.
     """
     low_metres, high_metres = metres_per_radian(frame, 0), metres_per_radian(frame, 1)
     low_range, high_range = 2 * math.pi * low_metres, 2 * math.pi * high_metres

@@ -28,16 +28,9 @@ _SLOPE, _OFFSET = -0.5330578, 0.7694894 * math.log2(10)  # ln of the tolerated r
 
 
 def estimate(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-    """Answer as LF2 does.
+    """Answer as LF2 does: depth (B, 1, 2H, 2W), metres, unit normals (B, 3, 2H, 2W), and what was measured, bool.
 
-    Returns
-    -------
-    depth
-        (B, 1, 2H, 2W) metres; pixels that the filter gives up carry the decoded depth and are not measured.
-    normals
-        (B, 3, 2H, 2W) unit.
-    measured
-        (B, 1, 2H, 2W) bool.
+    Pixels that the filter gives up carry the decoded depth and are not measured.
     """
     (low, low_apart), (high, high_apart) = (bilateral(z) for z in frame.phasor.chunk(2, dim=1))
     depth, gap = decode(frame, low, high)
