@@ -16,8 +16,13 @@ from calibration.board.geometry import load_board
 from calibration.cli.align import _page
 from calibration.evidence import judged_evidence, read_evidence
 from calibration.evidence.compare import OldRig, drift, drift_text, load_old, uncertainty
-from calibration.evidence.page import image_medians, page_content, write_evidence_page
-from calibration.evidence.samples import Samples, sample_recording
+from calibration.evidence.page import (
+    Samples,
+    image_medians,
+    page_content,
+    sample_recording,
+    write_evidence_page,
+)
 from calibration.limits import LIMITS, judged, worst
 from tofcapture.camera import Camera
 from tofcapture.colours import Scale

@@ -18,7 +18,7 @@ from tofcapture.files.shard import GroundTruth
 from tofcapture.files.view import view_path, write_view
 from tofcapture.poses import look_at
 from tofcapture.rig import dumps_rig
-from tofcapture.viz.figures.clouds import eye_for, splat
+from tofcapture.viz.clouds import eye_for, splat
 from tofcapture.viz.figures.preprocessing import gap, preprocess
 from tofcapture.viz.figures.scenes import Maps, read_rows
 

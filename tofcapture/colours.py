@@ -112,20 +112,11 @@ def palette(name: str) -> UInt8:
 def scale_for(
     kind: Kind, images: Sequence[NDArray[Any]], objects: Sequence[NDArray[np.bool_]] = (), unit: str = ""
 ) -> Scale:
-    """Choose the scale that images of one kind share.
+    """Choose the scale that images (H, W) of one kind share; NaN: none.
 
-    Parameters
-    ----------
-    kind
-        Depth shows the object: 1 to 99 percent of it with a fifth of that beside it. Where no object is known it covers
-        2 to 75 percent of everything, which leaves out what is far behind. Errors end at round numbers above 95 percent,
-        signed ones symmetric about 0; amplitude at one above 99 percent.
-    images
-        (H, W) values in the unit of the scale, NaN: none.
-    objects
-        Where the object is, one for each image that has one; shapes of the images.
-    unit
-        Other than that of the kind.
+    Depth shows the object: 1 to 99 percent of it with a fifth of that beside it. ``objects`` say where it is in the first
+    images. Where no object is known, depth covers 2 to 75 percent of everything, which leaves out what is far behind. Errors
+    end at round numbers above 95 percent, signed ones symmetric about 0; amplitude at one above 99 percent.
     """
     colours, usual, gamma = _KINDS[kind]
     if kind != "depth":

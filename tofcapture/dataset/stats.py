@@ -21,27 +21,21 @@ BINS = 400
 STANDS_OUT = 6.0  # robust standard deviations of a view's number from the median of all views
 FEWEST = 8  # views below which nothing can stand out
 _WORST = 1e3  # deviations of a view that has no good pixel at all
-_FLOOR = {  # of the deviation, so that views that are all but equal do not make a hair stand out
-    "gt_depth": 0.01,
-    "tof_depth": 0.01,
-    "tof_minus_gt": 0.001,
-    "amplitude": 1.0,
-    "incidence": 1.0,
-    "celsius": 0.5,
-    "good_share": 0.02,
-    "flagged_share": 0.01,
-}
 _PER_MAD = 1.4826  # standard deviations of a normal distribution per median absolute deviation
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is counted: name, unit, the histogram's range, and whether its bins grow by a constant factor."""
+    """What is counted: name, unit, the histogram's range, and whether its bins grow by a constant factor.
+
+    ``floor`` is the least deviation of views that counts, so that where all are but equal no hair stands out.
+    """
 
     name: str
     unit: str
     low: float
     high: float
+    floor: float
     log: bool = False
 
     @property
@@ -52,13 +46,14 @@ class Quantity:
 
 
 QUANTITIES = (
-    Quantity("gt_depth", "m", 0.0, 10.0),
-    Quantity("tof_depth", "m", 0.0, 10.0),
-    Quantity("tof_minus_gt", "m", -0.1, 0.1),
-    Quantity("amplitude", "DN", 0.1, 1e5, log=True),
-    Quantity("incidence", "deg", 0.0, 90.0),
-    Quantity("celsius", "degC", -40.0, 125.0),
+    Quantity("gt_depth", "m", 0.0, 10.0, 0.01),
+    Quantity("tof_depth", "m", 0.0, 10.0, 0.01),
+    Quantity("tof_minus_gt", "m", -0.1, 0.1, 0.001),
+    Quantity("amplitude", "DN", 0.1, 1e5, 1.0, log=True),
+    Quantity("incidence", "deg", 0.0, 90.0, 1.0),
+    Quantity("celsius", "degC", -40.0, 125.0, 0.5),
 )
+_FLOOR = {q.name: q.floor for q in QUANTITIES} | {"good_share": 0.02, "flagged_share": 0.01}
 
 
 @dataclass

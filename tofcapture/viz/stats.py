@@ -10,8 +10,8 @@ from tofcapture.dataset.stats import QUANTITIES, STANDS_OUT, DatasetStats, Quant
 from tofcapture.files.manifest import load_manifest
 from tofcapture.viz.charts import lines
 from tofcapture.viz.page import Picture, map_picture, mask_legend, mask_picture, normal_picture, write_page
-from tofcapture.viz.sharded import shard_shot
 from tofcapture.viz.shots import scales_of
+from tofcapture.viz.sources import shard_shot
 
 _SCENES = 2  # shown of each split
 _ENDS = ("min", "p1", "p50", "p99", "max")

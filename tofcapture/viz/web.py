@@ -63,15 +63,7 @@ def quiet_environment(folder: Path) -> dict[str, str]:
 
 
 def show_window(rrd: Path) -> None:
-    """Show a file in Rerun's window until it is closed.
-
-    Raises
-    ------
-    ConfigError
-        Rerun is not installed.
-    DeviceError
-        It ends with an error, for instance because there is no screen.
-    """
+    """Show a file in Rerun's window until it is closed; :class:`DeviceError` where there is no screen, for instance."""
     with tempfile.TemporaryDirectory(prefix="tofcapture-view-") as folder:
         words = [_program(), "--bind", LOOPBACK, "--port", "auto", str(rrd)]
         done = subprocess.run(
@@ -92,15 +84,7 @@ def _free_port() -> int:
 
 
 def save_page(folder: Path) -> None:
-    """Take Rerun's page from its own server into a folder, without what it would load from elsewhere.
-
-    Raises
-    ------
-    ConfigError
-        Rerun is not installed.
-    DeviceError
-        Its server does not answer.
-    """
+    """Take Rerun's page from its own server into a folder, without what it would load from elsewhere."""
     with tempfile.TemporaryDirectory(prefix="tofcapture-view-") as quiet:
         port = _free_port()
         bound = ("--bind", LOOPBACK, "--port", str(_free_port()))

@@ -27,21 +27,15 @@ def write_report(
     Parameters
     ----------
     dataset
-        Folder that ``build-dataset`` wrote: example views, rig, digests. None: their sections say that they are absent.
-    results
-        ``results.json`` of ``evaluate``: the headline and the tables.
-    evidence
-        ``evidence.json`` of ``align``; None or a missing file: the section says so.
+        Folder that ``build-dataset`` wrote: example views, rig, digests.
+    results, evidence
+        ``results.json`` of ``evaluate``, ``evidence.json`` of ``align``. Sections of what is None or missing say so.
     weights
         Checkpoint or folder of a run; None: the bundled weights. Where there are none, pictures show the sensor alone.
     out
         The HTML file, written atomically.
     views
         Number of example views, taken evenly from the split that ``results`` names, otherwise from ``test``.
-
-    Returns
-    -------
-    ``out``
 
     Raises
     ------

@@ -19,8 +19,7 @@ from tofcapture.poses import Float64, invert, rotation_log
 from tofcapture.rig import RangeError, Rig
 from tofcapture.viz.charts import chart, draw_rig, lines
 from tofcapture_model.config import dumps_config
-from tofcapture_model.report.examples import choose, load_examples
-from tofcapture_model.report.panels import panels
+from tofcapture_model.report.examples import choose, load_examples, panels
 from tofcapture_model.report.scores import POOLS, headline, sample, tables, tiles
 from tofcapture_model.report.sources import Network, Sources, doubts
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from tofcapture_model.evaluation.tables import RANKS, Column, column_cells, value_of
-from tofcapture_model.report.panels import METHOD_TITLES
+from tofcapture_model.report.examples import METHOD_TITLES
 
 POOLS = {"pixel": "all pixels pooled", "image": "mean over images"}
 DEPTH = (

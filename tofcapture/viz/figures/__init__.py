@@ -30,22 +30,10 @@ class Choice:
 
 
 def write_figure(kind: str, path: Path, out: Path, choice: Choice) -> str:
-    """Draw a figure 1200 pixels wide.
+    """Draw a figure 1200 pixels wide; returns what is on it, in words.
 
-    Parameters
-    ----------
-    kind
-        ``acquisition``, ``preprocessing``, ``depth`` or ``normals``.
-    path
-        Recording for the first, view file or recording for the second, dataset or shard for the others.
-    out
-        Of the figure: ``.png``, ``.pdf`` or ``.svg``; replaced when it exists, and left alone when drawing fails.
-    choice
-        What of it.
-
-    Returns
-    -------
-    What is on it, in words.
+    ``acquisition`` takes a recording, ``preprocessing`` a view file or a recording, ``depth`` and ``normals`` a dataset or a
+    shard. A ``.png``, ``.pdf`` or ``.svg`` that exists is replaced, and left alone when drawing fails.
 
     Raises
     ------

@@ -18,9 +18,9 @@ from tofcapture.ops.crop import crop_depth
 from tofcapture.ops.denoise import denoise
 from tofcapture.poses import Float64, transform_points
 from tofcapture.rig import Rig, load_rig
-from tofcapture.viz.captured import pick_view
-from tofcapture.viz.figures.clouds import Eye, eye_for, splat
-from tofcapture.viz.table import Cell, Column, draw_table
+from tofcapture.viz.clouds import Eye, eye_for, splat
+from tofcapture.viz.sheet import Cell, Column, draw_table
+from tofcapture.viz.sources import pick_view
 
 _CONFIG = SampleConfig()
 _AROUND = 2.5  # radii of the object that are shown around it before it is cropped

@@ -16,9 +16,9 @@ from tofcapture.errors import DataError, UsageError
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.shard import GroundTruth, ShardReader
 from tofcapture.poses import Float64
-from tofcapture.viz.figures.clouds import eye_for, splat
-from tofcapture.viz.sharded import read_maps
-from tofcapture.viz.table import DEPTH_KEY, NORMAL_KEY, Cell, Column, draw_table
+from tofcapture.viz.clouds import eye_for, splat
+from tofcapture.viz.sheet import DEPTH_KEY, NORMAL_KEY, Cell, Column, draw_table
+from tofcapture.viz.sources import read_maps
 
 Float32 = NDArray[np.float32]
 _ROOM = 1.3  # of the window about the object, relative to the object

@@ -58,30 +58,11 @@ def eye_for(points: Float64, T_base_tof: Float64, aspect: float = 4 / 3) -> Eye:
 
 
 def splat(
-    clouds: Sequence[tuple[NDArray[Any], Any]],
-    eye: Eye,
-    width: int = 480,
-    size: int = 2,
-    ground: int = 255,
+    clouds: Sequence[tuple[NDArray[Any], Any]], eye: Eye, width: int = 480, size: int = 2, ground: int = 255
 ) -> UInt8:
-    """Draw clouds on a plain ground.
+    """Draw clouds as (H, W, 3) uint8 on a plain grey ground, points as squares of ``size`` pixels.
 
-    Parameters
-    ----------
-    clouds
-        Points (..., 3) in the ToF frame, metres, NaN allowed, and of each cloud its colour (3,) or colours (..., 3).
-    eye
-        From where.
-    width
-        Of the picture, pixels.
-    size
-        Edge of a point, pixels.
-    ground
-        Grey of what no point covers.
-
-    Returns
-    -------
-    (H, W, 3) uint8.
+    A cloud is its points (..., 3) in the ToF frame, metres, NaN allowed, and its colour (3,) or colours (..., 3).
     """
     height = round(width / eye.aspect)
     found: list[tuple[Any, Any, Any]] = [(np.zeros(0, np.intp), np.zeros(0), np.zeros((0, 3)))]
