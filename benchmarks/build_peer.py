@@ -6,6 +6,7 @@ points at 1x and 2x. Ran by benchmarks/build.py.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from tofcapture.camera import Camera
 from tofcapture.files.view import read_view
 from tofcapture.frames import View
 from tofcapture.o3d import load_open3d
-from tofcapture.ops.phase import decode, mean_phasors
+from tofcapture.ops.phase import Decoder
 from tofcapture.rig import Rig
 
 
@@ -40,15 +41,15 @@ def process(view: View, rig: Rig) -> tuple[dict[str, np.ndarray], np.ndarray]:
     cloud, _ = cloud.remove_statistical_outlier(20, 2.0)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(30))
     cloud.orient_normals_towards_camera_location(np.zeros(3))
-    phasor = mean_phasors(view.tof.raw, view.tof.info.modulation_hz, view.tof.info.phase_rad)
-    radial = decode(phasor, view.tof.info.modulation_hz, rig.tof, rig.illuminator, rig.range_errors).radial
-    points = rig.tof.unproject(rig.tof.radial_to_depth(radial))
+    info = replace(view.tof.info, camera=rig.tof, illuminator=rig.illuminator, range_errors=rig.range_errors)
+    depth = Decoder(info).burst(view.tof.raw).depth
+    points = rig.tof.unproject(depth)
     tof = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[np.isfinite(points[..., 2])]))
     inverse = np.linalg.inv(rig.T_tof_stereo)
     found = o3d.pipelines.registration.registration_icp(
         tof, cloud, 0.02, inverse, o3d.pipelines.registration.TransformationEstimationPointToPlane()
     )
-    out = {"raw": view.tof.raw, "tof_depth": rig.tof.radial_to_depth(radial).astype(np.float32)}
+    out = {"raw": view.tof.raw, "tof_depth": depth}
     for name, T in (("icp", np.linalg.inv(found.transformation)), ("rig", rig.T_tof_stereo)):
         moved = np.asarray(cloud.points) @ T[:3, :3].T + T[:3, 3]
         turned = np.asarray(cloud.normals) @ T[:3, :3].T

@@ -5,13 +5,13 @@ import sys
 import numpy as np
 
 from tofcapture.files.shard import ShardReader
-from tofcapture.ops.phase import ambiguity, decode, frequencies, mean_phasors, wrapped_range
+from tofcapture.ops.phase import Decoder, ambiguity, frequencies, mean_phasors, wrapped_range
 
 
 def main(path: str) -> None:
     """Decode the first view's burst and compare with the depth in the shard."""
     with ShardReader(path) as shard:
-        info, camera = shard.info, shard.camera
+        info = shard.info
         raw = np.stack([shard.raw(0, f) for f in range(shard.frames)])  # (F, 8, H, W)
         celsius = float(np.mean([shard.celsius(0, f) for f in range(shard.frames)]))
         stored = shard.tof(0).depth
@@ -23,11 +23,7 @@ def main(path: str) -> None:
         span = wrapped_range(P, hz)
         print(f"{hz / 1e6:.0f} MHz: unique up to {ambiguity(hz):.2f} m, median range {np.median(span):.3f} m")
 
-    saturated = (raw >= info.saturation).any(axis=(0, 1))
-    decoded = decode(
-        phasor, info.modulation_hz, camera, info.illuminator, info.range_errors, celsius, saturated
-    )
-    depth = camera.radial_to_depth(decoded.radial)
+    depth = Decoder(info).burst(raw, celsius).depth
     both = np.isfinite(depth) & np.isfinite(stored)
     print(
         f"depth {np.median(depth[both]):.4f} m, median difference to the shard {1e3 * np.median(np.abs(depth - stored)[both]):.4f} mm"

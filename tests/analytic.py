@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from tests.decoding import decode
 from tofcapture.camera import Camera
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardWriter, TofMaps
 from tofcapture.frames import StereoInfo, TofInfo
-from tofcapture.ops.phase import decode, mean_phasors, taps
+from tofcapture.ops.phase import mean_phasors, taps
 from tofcapture.poses import look_at
 from tofcapture.rig import SPEED_OF_LIGHT, Rig
 

@@ -13,6 +13,7 @@ from calibration.cli import calibrate as calibrate_cli
 from calibration.range_error.fit import fit_ranges
 from calibration.range_error.surface import surface_at_pixels
 from calibration.range_error.views import seen_of
+from tests.decoding import decode
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.light import Light
@@ -139,12 +140,12 @@ def test_fitted_errors_correct_a_burst():
     rng = np.random.default_rng(0)
     fit = fit_ranges([made(i, rng) for i in range(VIEWS)], T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
     away = made(40, rng, sensor=replace(SENSOR, read_noise=0.0, shot_noise=False, quantise=False), away=0.83)
-    decoded = phase.decode(away.phasor, INFO.modulation_hz, CAMERA, INFO.illuminator, fit.errors, 45.0)
+    decoded = decode(away.phasor, INFO.modulation_hz, CAMERA, INFO.illuminator, fit.errors, 45.0)
     planes, good = surface_at_pixels(poses.transform_points(T_TOF_STEREO, away.points), CAMERA)
     off = decoded.radial - CAMERA.ray_lengths / (planes * CAMERA.rays).sum(axis=-1)
     assert np.sqrt(np.mean(np.square(off[good]))) < 1e-3
     errors = tuple(replace(e, per_inverse_amplitude=0.1) for e in fit.errors)
-    slow = phase.decode(away.phasor, INFO.modulation_hz, CAMERA, INFO.illuminator, errors, 45.0)
+    slow = decode(away.phasor, INFO.modulation_hz, CAMERA, INFO.illuminator, errors, 45.0)
     raw = phase.taps(away.phasor, 2 * np.abs(away.phasor), INFO.modulation_hz, INFO.phase_rad)
     fast = phase.Decoder(replace(INFO, range_errors=errors))(raw, 45.0)
     assert np.abs(fast.depth - CAMERA.radial_to_depth(slow.radial)).max() < 2e-5

@@ -7,20 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.decoding import correct_range, decode, range_to_radial
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
 from tofcapture.frames import PAPER_MODULATION_HZ as HZ
 from tofcapture.frames import PAPER_PHASE_RAD as PHASES
 from tofcapture.ops.phase import (
     ambiguity,
-    correct_range,
-    decode,
     frequencies,
     mean_phasors,
     phasors,
     radial_to_range,
     radius_px,
-    range_to_radial,
     taps,
     unwrap,
     wrapped_range,
@@ -173,5 +171,3 @@ def test_channels_that_do_not_determine_a_phasor_are_refused():
         phasors(np.zeros((3, 1, 1)), (20e6,) * 3, (0.0, np.pi, 0.0))
     with pytest.raises(DataError, match="channels"):
         phasors(np.zeros((7, 1, 1)), HZ, PHASES)
-    with pytest.raises(DataError, match="decode"):
-        decode(np.zeros((1, *CAMERA.shape), complex), HZ, CAMERA, ILLUMINATOR)

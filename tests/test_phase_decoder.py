@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.decoding import decode
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
 from tofcapture.frames import PAPER_MODULATION_HZ as HZ
@@ -16,7 +17,6 @@ from tofcapture.ops.phase import (
     Decoder,
     TapNoise,
     ambiguity,
-    decode,
     flying_pixels,
     frequencies,
     mean_phasors,

@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.decoding import decode
 from tests.test_sim_light import wall
 from tofcapture.devices.sim.config import Render, load_world, read_constants
 from tofcapture.devices.sim.sensor import Sensor
 from tofcapture.devices.sim.stereo import StereoModel
 from tofcapture.devices.sim.world import SimWorld, simulate
 from tofcapture.errors import ConfigError, DeviceError
-from tofcapture.ops.phase import decode, mean_phasors
+from tofcapture.ops.phase import mean_phasors
 from tofcapture.poses import rotation_angle
 
 SMALL = {

@@ -78,16 +78,15 @@ def joint_view_of(view: View) -> JointView:
     info = view.tof.info
     phasor, depth = tof_depth(view.tof)
     celsius = float(np.mean(view.tof.celsius))
-    decoded = phase.decode(
-        phasor, info.modulation_hz, info.camera, info.illuminator, info.range_errors, celsius
-    )
+    _, signals = phase.Decoder(info).signals(view.tof.raw.mean(axis=0, dtype=np.float64), celsius)
+    low, gap = (x.reshape(-1).astype(np.float64) for x in (signals.range_low, signals.gap))
     board = _pixels_of(surface_points(view.tof, depth), info.camera)
     pixels = board[::STRIDE]
     hz = phase.frequencies(info.modulation_hz)
     rays = (info.camera.rays / info.camera.ray_lengths[..., None]).reshape(-1, 3)
     high_sigma = range_sigma(view.tof).reshape(-1)[pixels]
     # Of the board alone: a dark pixel elsewhere has no amplitude to divide by.
-    lit = decoded.amplitude.reshape(len(hz), -1)[:, pixels]
+    lit = np.abs(phasor).reshape(len(hz), -1)[:, pixels]
     sigma = [high_sigma * hz[-1] / f * lit[-1] / a for f, a in zip(hz, lit, strict=True)]
     surface = stereo_cloud(view.stereo)
     stereo = unveiled_rims(view.stereo.points, view.stereo.info.camera)
@@ -96,7 +95,7 @@ def joint_view_of(view: View) -> JointView:
         modulation_hz=hz,
         rays=rays[pixels],
         radius_px=phase.radius_px(info.camera).reshape(-1)[pixels],
-        ranges=np.stack([decoded.range_low.reshape(-1)[pixels], decoded.range_high.reshape(-1)[pixels]]),
+        ranges=np.stack([low, low - gap])[:, pixels],
         sigma=np.stack(sigma),
         halos=halo_errors(phasor, hz).reshape(len(hz), -1, len(HALO_RADII))[:, pixels],
         rims=_beside(lit_rims(phasor, depth, info.camera, info.illuminator), board, info.camera),

@@ -104,13 +104,9 @@ def tof_depth(burst: TofBurst) -> tuple[NDArray[np.complex128], Float64]:
     The depth (H, W), metres, is NaN where a tap was saturated or nothing can be decoded.
     """
     info = burst.info
-    saturated = np.asarray((burst.raw >= info.saturation).any(axis=(0, 1)))
     phasor = phase.mean_phasors(burst.raw, info.modulation_hz, info.phase_rad)
-    celsius = float(np.mean(burst.celsius))
-    decoded = phase.decode(
-        phasor, info.modulation_hz, info.camera, info.illuminator, info.range_errors, celsius, saturated
-    )
-    return phasor, info.camera.radial_to_depth(decoded.radial)
+    depth = phase.Decoder(info).burst(burst.raw, float(np.mean(burst.celsius))).depth
+    return phasor, depth.astype(np.float64)
 
 
 def surface_points(burst: TofBurst, depth: Float64) -> Float64:

@@ -3,7 +3,7 @@
 ``C_k = B + A cos(phi + theta_k)``; with theta = 0, 90, 180, 270 deg, ``phi = atan2(C3 - C1, C0 - C2)``. A phasor is the
 complex number ``A exp(i phi)``. Bursts are averaged as phasors, never as phases or depths.
 
-:class:`Decoder` turns taps into depth at more than a thousand frames a second. :func:`decode` is its float64 reference.
+:class:`Decoder` turns taps into depth at more than a thousand frames a second.
 """
 
 from tofcapture.ops.phase.decoder import Decoder, DepthMaps, Signals, flying_pixels
@@ -19,21 +19,17 @@ from tofcapture.ops.phase.phasors import (
     taps,
     wrapped_range,
 )
-from tofcapture.ops.phase.reference import Decoded, correct_range, decode, range_to_radial
 from tofcapture.ops.phase.unwrapping import unwrap, unwrap_spatial
 from tofcapture.rig import radius_px
 
 __all__ = [
     "Complex128",
-    "Decoded",
     "Decoder",
     "DepthMaps",
     "Float64",
     "Signals",
     "TapNoise",
     "ambiguity",
-    "correct_range",
-    "decode",
     "flying_pixels",
     "frequencies",
     "mean_phasors",
@@ -41,7 +37,6 @@ __all__ = [
     "photon_transfer",
     "radial_to_range",
     "radius_px",
-    "range_to_radial",
     "taps",
     "unwrap",
     "unwrap_spatial",

@@ -1,6 +1,7 @@
 """Decoding at the speed of the sensor and more: one camera's tables built once, float32, blocks that stay in the cache.
 
-The same mathematics as :func:`tofcapture.ops.phase.decode`, which the tests hold it against.
+Range errors are taken off per frequency, the high one is unwrapped by the low one, and both are fused with weights
+proportional to f^2, the inverse variance at equal phase noise (method.md 4.3).
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ class Signals:
     """What was on the way from taps to depth."""
 
     phasor: Float32  #: (2, 2, H, W) float32: I and Q of the low, then of the high frequency; raw units.
-    #: (H, W) float32: range of the low minus range of the high frequency, within half a range of the high
-    #: one; metres, NaN where there is no light.
+    range_low: Float32  #: (H, W) by the low frequency alone, metres: half the path to the surface and back.
+    #: (H, W) range of the low minus range of the high frequency, within half a range of the high one; metres,
+    #: NaN where there is no light.
     gap: Float32
 
 
@@ -100,8 +102,7 @@ class Decoder:
     def signals(self, raw: NDArray[Any], celsius: float = float("nan")) -> tuple[DepthMaps, Signals]:
         """Decode one frame (K, H, W), or the mean of some, and keep the phasors and the gap between the frequencies."""
         self._expect(raw.shape)
-        shape = self.info.camera.shape
-        kept = Signals(np.empty((2, 2, *shape), np.float32), np.empty(shape, np.float32))
+        kept = Signals(*(np.empty((*n, *self.info.camera.shape), np.float32) for n in ((2, 2), (), ())))
         return self._decode(raw, celsius, 1, raw.max(axis=0), kept), kept
 
     def burst(self, raw: NDArray[Any], celsius: float = float("nan")) -> DepthMaps:
@@ -132,8 +133,8 @@ class Decoder:
             for at in (slice(i, min(i + _BLOCK, n)) for i in range(0, n, _BLOCK)):
                 iq = None if kept is None else kept.phasor.reshape(2, 2, -1)[..., at]
                 phases = self._phases(flat[:, at], frames, confidence[at], flags[at], bad[at], iq)
-                gap = None if kept is None else kept.gap.reshape(-1)[at]
-                self._ranges(phases, at, celsius, flags[at], gap)
+                ranges = None if kept is None else (kept.range_low.reshape(-1)[at], kept.gap.reshape(-1)[at])
+                self._ranges(phases, at, celsius, flags[at], ranges)
                 self._depth(phases, at, depth[at], bad[at])
         # Integers are compared with an integer: not one of them is converted.
         limit = self.info.saturation if largest.dtype.kind == "f" else math.ceil(self.info.saturation)
@@ -173,7 +174,7 @@ class Decoder:
 
     def _ranges(
         self, phases: tuple[Float32, Float32], at: slice, celsius: float, flags: NDArray[np.uint8],
-        kept: Float32 | None,
+        kept: tuple[Float32, Float32] | None,
     ) -> None:  # fmt: skip
         """Free ranges of their systematic errors, unwrap the high one, fuse both; the result lies in the low one."""
         (low, high), (gap, work) = phases
@@ -184,7 +185,8 @@ class Decoder:
         gap *= 1 / self._R[1]
         gap -= np.rint(gap, out=work)
         if kept is not None:
-            np.multiply(gap, self._R[1], out=kept)
+            np.copyto(kept[0], low)
+            np.multiply(gap, self._R[1], out=kept[1])
         np.abs(gap, out=work)
         flags |= (work > _AMBIGUOUS).view(np.uint8) * np.uint8(TofFlag.AMBIGUOUS)
         gap *= self._lean

@@ -1,4 +1,4 @@
-"""The float64 way from phasors to distance: what alignment measures with, and what the fast decoder is held against."""
+"""The float64 way from phasors to distance: the oracle that the decoder is held against."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.errors import DataError
 from tofcapture.ops.phase.phasors import Complex128, Float64, ambiguity, frequencies, wrapped_range
 from tofcapture.ops.phase.unwrapping import centred, unwrap, unwrap_spatial
 from tofcapture.rig import RangeError, image_places, radius_px
@@ -30,34 +29,10 @@ class Decoded:
 def decode(
     phasor: Complex128, modulation_hz: Sequence[float], camera: Camera, illuminator: NDArray[np.floating],
     range_errors: Sequence[RangeError] = (), celsius: float = 45.0, saturated: NDArray[np.bool_] | None = None,
-    min_amplitude: float = 0.0, tap_sigma: float | None = None,
+    tap_sigma: float | None = None,
 ) -> Decoded:  # fmt: skip
-    """Decode phasors of two frequencies to distance.
-
-    Range errors are taken off per frequency and the high one is unwrapped by the low one. Both are fused with weights
-    proportional to f^2, the inverse variance at equal phase noise (method.md 4.3).
-
-    Parameters
-    ----------
-    phasor, modulation_hz
-        (2, H, W), frequencies ascending, and (K,) of the raw channels, which gives the two frequencies.
-    camera, illuminator, range_errors, celsius
-        Intrinsics, light source (3,) in metres, calibration, sensor temperature.
-    saturated, min_amplitude
-        Pixels (H, W) that become NaN, as do those whose weaker amplitude is not above the least, raw units.
-    tap_sigma
-        Noise of a tap, raw units: neighbours decide the wrap where a pixel is too dark. ``None``: rounding decides.
-
-    Raises
-    ------
-    DataError
-        When there are not exactly two frequencies, or shapes disagree.
-    """
+    """Decode phasors (2, H, W); with the noise of a tap, neighbours decide the wrap where a pixel is too dark."""
     hz = frequencies(modulation_hz)
-    if len(hz) != 2 or phasor.shape != (2, *camera.shape):
-        raise DataError(
-            f"decode: expected phasors (2, {camera.height}, {camera.width}), got {phasor.shape} for {hz}"
-        )
     by_hz = {e.modulation_hz: e for e in range_errors}
     celsius = celsius if np.isfinite(celsius) else 45.0
     amplitude = np.abs(phasor)
@@ -74,7 +49,7 @@ def decode(
         high = unwrap_spatial(low, high, amplitude, R_high, R_low, tap_sigma)
         gap = centred(centred(low - high, R_low), R_high)
     fused = np.mod(high + hz[0] ** 2 / (hz[0] ** 2 + hz[1] ** 2) * gap, R_low)
-    bad = ~(amplitude.min(axis=0) > min_amplitude)
+    bad = ~(amplitude.min(axis=0) > 0)
     bad |= False if saturated is None else saturated
     radial = np.where(bad, np.nan, range_to_radial(fused, camera, illuminator))
     return Decoded(radial, low, high, amplitude)
@@ -86,7 +61,6 @@ def correct_range(
     """Take the systematic error of one frequency off its wrapped range and wrap again, metres.
 
     The error is a function of the true phase: a fixed point, iterated until it moves less than 0.01 micrometres.
-    ``amplitude`` (..., H, W) is needed where the error depends on it.
     """
     R = ambiguity(error.modulation_hz)
     radius, place = radius_px(camera), image_places(camera)
