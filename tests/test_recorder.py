@@ -20,7 +20,7 @@ from tofcapture.record import recorder, resources
 from tofcapture.record.journal import Journal, journal_path
 from tofcapture.record.plan import object_sampling
 from tofcapture.record.recorder import record
-from tofcapture.record.resources import hold_recording
+from tofcapture.record.resources import hold_file
 from tofcapture.rig import Rig
 
 TOF, STEREO = Camera(8, 6, 7.0, 7.0, 3.5, 2.5), Camera(10, 8, 9.0, 9.0, 4.5, 3.5)
@@ -257,7 +257,7 @@ def test_other_cameras_are_refused(tmp_path):
 def test_only_one_recorder(tmp_path):
     """A second recorder of the same recording is told to wait, and who holds it."""
     tmp_path.mkdir(exist_ok=True)
-    with hold_recording(tmp_path), pytest.raises(BusyError, match=str(os.getpid())):
+    with hold_file(tmp_path / ".lock", "", ""), pytest.raises(BusyError, match=str(os.getpid())):
         _record(tmp_path)
     assert _record(tmp_path).recorded == tuple(range(VIEWS))
 

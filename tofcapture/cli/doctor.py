@@ -24,10 +24,10 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 from tofcapture import __version__
-from tofcapture.cli.probe import Finding, probe
+from tofcapture.cli.probe import Finding, attempt, probe
 from tofcapture.cli.setup import bundled_path, describe_weights, station_path
 from tofcapture.command import Command, Outcome
-from tofcapture.errors import ConfigError, FormatError, TofError
+from tofcapture.errors import ConfigError, TofError
 
 Examination = Callable[[], Iterator[Finding]]
 Versions = Callable[[str], str | None]
@@ -122,14 +122,8 @@ def check_weights() -> Iterator[Finding]:
     path = bundled_path()
     if path is None:
         yield Finding("weights", "WARN", "no trained network is bundled", "name one with --weights")
-        return
-    try:
-        found = describe_weights(path)
-    except FormatError as err:
-        yield Finding.of("weights", "WARN", err)
-        return
-    text = f"bundled: {found.kind}, {found.weights / 1e6:.2f} million weights, {found.size / 1e6:.1f} MB"
-    yield Finding("weights", "PASS", text)
+    else:
+        yield attempt("weights", lambda: f"bundled: {describe_weights(path)}", "WARN")
 
 
 def check_folder(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> Iterator[Finding]:

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,13 @@ class Finding:
     found: str
     advice: str = ""
 
-    @classmethod
-    def of(cls, what: str, verdict: str, error: TofError, said: str = "") -> Finding:
-        """Make a finding of an error, in its own words."""
-        return cls(what, verdict, said + error.message, error.hint)
+
+def attempt(what: str, action: Callable[[], str], verdict: str = "FAIL", said: str = "") -> Finding:
+    """Do something that says what it found; an error becomes a finding in its own words."""
+    try:
+        return Finding(what, "PASS", action())
+    except TofError as err:
+        return Finding(what, verdict, said + err.message, err.hint)
 
 
 def probe(name: str, *arguments: str, timeout: float = 60.0) -> list[Finding]:
@@ -102,10 +105,8 @@ def probe_open3d() -> Iterator[Finding]:
     """Load open3d; a missing libusb is its usual trouble."""
     from tofcapture.o3d import load_open3d
 
-    try:
-        yield Finding("open3d", "PASS", f"{load_open3d().__version__}, loads")
-    except TofError as err:
-        yield Finding.of("open3d", "FAIL" if _version("open3d", "open3d-cpu") else "WARN", err)
+    verdict = "FAIL" if _version("open3d", "open3d-cpu") else "WARN"
+    yield attempt("open3d", lambda: f"{load_open3d().__version__}, loads", verdict)
 
 
 def probe_ur_rtde() -> Iterator[Finding]:
@@ -119,13 +120,14 @@ def probe_nxlib() -> Iterator[Finding]:
     found = _import("nxlib", ("nxlib",), "pip install 'tofcapture[hardware]', for Ensenso cameras")
     yield found
     if found.verdict == "PASS":
-        from tofcapture.devices.ensenso import library
+        yield attempt("Ensenso SDK", _load_ensenso, "WARN")
 
-        try:
-            with library(None):
-                yield Finding("Ensenso SDK", "PASS", "loads")
-        except TofError as err:
-            yield Finding.of("Ensenso SDK", "WARN", err)
+
+def _load_ensenso() -> str:
+    from tofcapture.devices.ensenso import library
+
+    with library(None):
+        return "loads"
 
 
 def probe_drivers() -> Iterator[Finding]:
@@ -168,47 +170,51 @@ def probe_station(path: str, opening: str = "") -> Iterator[Finding]:
     from tofcapture.devices.station import open_station, read_station
 
     file = Path(path) if path else None
-    try:
-        config = read_station(file)
-        stage_of(config)
-    except TofError as err:
-        yield Finding.of("station", "FAIL", err)
-        return
-    context = StationContext(config=config, folder=(file or Path()).resolve().parent)
-    found = [finding for role in ROLES for finding in _probe_device(role, context)]
-    found += _probe_rig(context)
-    yield Finding("station", "PASS", f"{path or 'the simulated one'} is read")
+    context = StationContext(config={}, folder=(file or Path()).resolve().parent)
+
+    def read() -> str:
+        nonlocal context
+        context = replace(context, config=read_station(file))
+        stage_of(context.config)
+        return f"{path or 'the simulated one'} is read"
+
+    def open_all() -> str:
+        with open_station(file) as station:
+            joints = ", ".join(f"{q:.2f}" for q in station.arm.state().joints)
+            return f"all open; the arm stands at {joints} rad"
+
+    found = [attempt("station", read)]
+    if found[0].verdict == "PASS":
+        found += [finding for role in ROLES for finding in _probe_device(role, context)]
+        found += _probe_rig(context)
+    if opening and all(f.verdict != "FAIL" for f in found):
+        found.append(attempt("devices", open_all))
     yield from found
-    if opening and not any(f.verdict == "FAIL" for f in found):
-        try:
-            with open_station(file) as station:
-                joints = ", ".join(f"{q:.2f}" for q in station.arm.state().joints)
-                yield Finding("devices", "PASS", f"all open; the arm stands at {joints} rad")
-        except TofError as err:
-            yield Finding.of("devices", "FAIL", err)
 
 
 def _probe_device(role: str, context: Any) -> Iterator[Finding]:
     """Make and describe a device, and ask whether it is there where that disturbs nothing."""
     from tofcapture.devices.registry import make_device
 
-    said, described = "", True
     try:
         device = make_device(role, context)
-        said = f"driver {context.config[role]['driver']}"
-        if role != "operator":
-            try:
-                info = device.describe()
-                said = f"{said}: {info.model} {info.serial}".rstrip()
-            except TofError as err:
-                described = False
-                yield Finding.of(role, "WARN", err)
-        there = device.probe()
     except TofError as err:
-        yield Finding.of(role, "FAIL", err, f"{said}: " if said else "")
-    else:
-        if there or described:
-            yield Finding(role, "PASS", f"{said}; {there}" if there else said)
+        yield Finding(role, "FAIL", err.message, err.hint)
+        return
+    said = f"driver {context.config[role]['driver']}"
+    described = True
+    if role != "operator":
+        try:
+            info = device.describe()
+            said = f"{said}: {info.model} {info.serial}".rstrip()
+        except TofError as err:
+            described = False
+            yield Finding(role, "WARN", err.message, err.hint)
+    found = attempt(role, device.probe, said=f"{said}: ")
+    if found.verdict == "PASS":
+        found = replace(found, found=f"{said}; {found.found}" if found.found else said)
+    if found.verdict != "PASS" or described or found.found != said:
+        yield found
 
 
 def _probe_rig(context: Any) -> Iterator[Finding]:
@@ -216,11 +222,7 @@ def _probe_rig(context: Any) -> Iterator[Finding]:
     from tofcapture.rig import load_rig
 
     if path := context.config.get("rig", {}).get("path"):
-        try:
-            load_rig(context.folder / str(path))
-            yield Finding("rig", "PASS", str(path))
-        except TofError as err:
-            yield Finding.of("rig", "FAIL", err)
+        yield attempt("rig", lambda: str(load_rig(context.folder / str(path)) and path))
     elif "rig" not in context.shared:
         advice = 'add [rig] path = "rig.toml", the bracket\'s drawing for a start; see docs/formats.md'
         yield Finding("rig", "FAIL", "the station names none", advice)

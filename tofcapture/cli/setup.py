@@ -46,6 +46,9 @@ class BundledWeights:
     kind: str
     weights: int
 
+    def __str__(self) -> str:
+        return f"{self.kind}, {self.weights / 1e6:.2f} million weights, {self.size / 1e6:.1f} MB"
+
 
 def bundled_path() -> Path | None:
     """Find the bundled weights without importing what runs them; ``None`` when there are none."""

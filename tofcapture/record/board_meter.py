@@ -20,29 +20,17 @@ CELLS = (9, 12)  # of the image
 
 
 def lean_of(T_base_tof: Float64, normal: Float64) -> Float64:
-    """(..., 2) how the board's normal leans in the image, x right and y down; its length is the sine of the tilt to the axis.
+    """Find how the normal (3,) of the board's front leans in the image of poses (..., 4, 4): (..., 2), x right and y down.
 
-    Parameters
-    ----------
-    T_base_tof
-        (..., 4, 4).
-    normal
-        (3,) of the board's front, base frame.
+    The length is the sine of the tilt to the axis.
     """
     return np.asarray(np.swapaxes(T_base_tof[..., :3, :2], -1, -2) @ normal, dtype=np.float64)
 
 
 def meter(poses: Sequence[Float64], board: Float64, normal: Float64, camera: Camera) -> str:
-    """Lay out tilts, directions, distances and the share of the image in four lines.
+    """Lay out tilts, directions, distances and the share of the image, in three lines.
 
-    Parameters
-    ----------
-    poses
-        N of (4, 4) ``T_base_tof``.
-    board, normal
-        (3,) centre of the board and normal of its front, base frame, metres.
-    camera
-        ToF intrinsics.
+    ``poses`` are ``T_base_tof`` (4, 4), ``board`` and ``normal`` (3,) centre and front of the board, base frame, metres.
     """
     if not poses:
         return "no board views yet"

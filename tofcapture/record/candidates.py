@@ -39,31 +39,15 @@ JOINT_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.25])  # in "close to home" 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Where candidates lie.
+    """Where candidates lie; lengths in metres, angles in radians."""
 
-    Attributes
-    ----------
-    axis
-        (3,) direction from the target about which views are spread.
-    tilt
-        Smallest and largest angle to the axis, radians.
-    distances
-        From the ToF camera to the target, metres.
-    aim
-        How far from the target the camera may look, metres.
-    directions, rolls
-        How many of each are tried; of the rolls, the one nearest to home is kept.
-    lean
-        How much it counts, in radians, that the axis leans in another direction of the image.
-    """
-
-    axis: Float64
-    tilt: tuple[float, float] = (0.0, float(np.radians(65.0)))
+    axis: Float64  # (3,) direction from the target about which views are spread
+    tilt: tuple[float, float] = (0.0, float(np.radians(65.0)))  # smallest and largest angle to the axis
     distances: tuple[float, ...] = (0.35, 0.43, 0.53, 0.65, 0.80, 0.98, 1.18, 1.38)
-    aim: float = 0.02
+    aim: float = 0.02  # how far from the target the camera may look
     directions: int = 400
-    rolls: int = 4
-    lean: float = 0.0
+    rolls: int = 4  # the one nearest to home is kept
+    lean: float = 0.0  # how much it counts that the axis leans in another direction of the image
 
 
 def object_sampling() -> Sampling:
@@ -134,14 +118,9 @@ def leans(rig: Rig, axis: Float64, T_base_flange: Float64) -> Float64:
 def hold_poses(
     model: ArmModel, rig: Rig, stage: Stage, T_base_flange: Float64
 ) -> tuple[Float64, NDArray[np.int8]]:
-    """Find joints that hold flange poses (C, rolls, 4, 4) and meet nothing.
+    """Find joints (C, 6), nearest to home, that hold flange poses (C, rolls, 4, 4) and meet nothing; NaN: there are none.
 
-    Returns
-    -------
-    joints
-        (C, 6) of the clear solution and roll nearest to home, NaN where there is none.
-    refusal
-        (C,) index into :data:`REFUSALS` of what stood in the way, -1 for nothing.
+    With them come refusals (C,): indices into :data:`REFUSALS` of what stood in the way, -1 for nothing.
     """
     count = len(T_base_flange)
     q = stage.home + wrap(inverse_all(model, T_base_flange) - stage.home)

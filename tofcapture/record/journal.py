@@ -39,20 +39,16 @@ ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'sealed', sha256 = exclu
 
 @dataclass(frozen=True)
 class JournalRow:
-    """What the journal says of one view.
-
-    ``pose`` is the planned view's digest, ``step`` what was begun last for a view that is not sealed
-    (``record.observer.STEPS``).
-    """
+    """What the journal says of one view."""
 
     scene: str
     index: int
-    pose: str
+    pose: str  # digest of the planned view
     state: str
     sha256: str | None
     attempts: int
     reason: str
-    step: str
+    step: str  # what was begun last for a view that is not sealed (record.observer.STEPS)
 
 
 def utc_now() -> str:
@@ -86,13 +82,7 @@ def open_database(path: Path, schema: str, what: str, hint: str) -> sqlite3.Conn
 
 
 class Journal:
-    """Open journal of a recording; one transaction per call, on disk when the call returns.
-
-    Parameters
-    ----------
-    recording
-        The folder; must exist.
-    """
+    """Open journal of a recording, whose folder exists; one transaction per call, on disk when the call returns."""
 
     def __init__(self, recording: Path) -> None:
         hint = "move it away: it is rebuilt from the view files"

@@ -44,30 +44,14 @@ _MOST_TURNS = 36
 
 @dataclass(frozen=True)
 class PlannedView:
-    """One view to take.
+    """One view to take; lengths in metres, angles in radians."""
 
-    Attributes
-    ----------
-    index
-        Number of the view: its rank in the sampling, not in the order of travel.
-    joints
-        (6,) goal, radians.
-    T_base_flange
-        (4, 4) nominal flange pose there.
-    distance
-        From the ToF camera to the target, metres.
-    direction
-        (3,) unit, from the target to the camera, base frame.
-    turn
-        Turn of the object about the vertical by then, counter-clockwise seen from above, radians.
-    """
-
-    index: int
-    joints: Float64
-    T_base_flange: Float64
-    distance: float
-    direction: Float64
-    turn: float = 0.0
+    index: int  # rank in the sampling, not in the order of travel
+    joints: Float64  # (6,) goal
+    T_base_flange: Float64  # (4, 4) nominal pose there
+    distance: float  # from the ToF camera to the target
+    direction: Float64  # (3,) unit, from the target to the camera, base frame
+    turn: float = 0.0  # of the object about the vertical, counter-clockwise seen from above
 
     @property
     def digest(self) -> str:
@@ -88,35 +72,20 @@ class PlannedView:
 
 @dataclass(frozen=True)
 class Tried:
-    """Candidates: where the camera would stand ``spots`` (C, 3), base frame, metres, and ``refusal`` (C,).
+    """What became of the candidates."""
 
-    A refusal is an index into :data:`REFUSALS`, -1 for a candidate that nothing stands against.
-    """
-
-    spots: Float64
-    refusal: NDArray[np.int8]
+    spots: Float64  # (C, 3) where the ToF camera would stand, base frame, metres
+    refusal: NDArray[np.int8]  # (C,) index into REFUSALS, -1 where nothing stands against it
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Views in the order of travel, and why there are not more.
-
-    Attributes
-    ----------
-    views
-        In the order to visit them.
-    wanted, candidates
-        How many were asked for, and how many were tried.
-    refused
-        Number of candidates for each of :data:`REFUSALS`; ``way from home`` counts those that sampling came upon.
-    tried
-        The candidates themselves, for the picture.
-    """
+    """Views in the order of travel, and why there are not more."""
 
     views: tuple[PlannedView, ...]
-    wanted: int
-    candidates: int
-    refused: dict[str, int]
+    wanted: int  # how many views were asked for
+    candidates: int  # how many were tried
+    refused: dict[str, int]  # candidates by refusal; "way from home" counts those that sampling came upon
     tried: Tried | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -192,27 +161,10 @@ def plan_views(
     rng: np.random.Generator,
     turns: int = 1,
 ) -> Plan:
-    """Plan views of a target.
+    """Plan views of a target (3,), base frame, metres; fewer than wanted where the arm reaches no more.
 
-    Parameters
-    ----------
-    model, rig, stage
-        The arm, what it carries, what stands around it.
-    target
-        (3,) what the ToF camera looks at, base frame, metres.
-    sampling
-        Where candidates lie.
-    views
-        How many are wanted.
-    rng
-        Turns and jitters the candidates; the same generator gives the same plan.
-    turns
-        In how many ways the object is put on the table, a full turn divided by this apart.
-
-    Returns
-    -------
-    Plan
-        With fewer views than wanted where the arm reaches no more. Views of one turn follow each other.
+    The same generator gives the same plan. With ``turns`` the object stands in so many ways, a full turn divided by this
+    apart; views of one turn follow each other.
     """
     directions, distances = candidates(sampling, rng)
     T_base_flange = flange_poses(rig, target, sampling, directions, distances, rng)

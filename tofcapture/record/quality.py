@@ -83,22 +83,10 @@ LIMITS = (
 def measure(
     tof: TofBurst, stereo: StereoFrame, before: ArmState, after: ArmState, rig: Rig, frames: int
 ) -> dict[str, float]:
-    """Find the numbers of a view.
+    """Find the number of each of :data:`LIMITS`, by name; ``flicker`` only of three frames or more.
 
-    Parameters
-    ----------
-    tof, stereo
-        What the cameras handed over.
-    before, after
-        Arm before the first and after the last exposure.
-    rig
-        As known: overlap is counted with it.
-    frames
-        ToF frames that were asked for.
-
-    Returns
-    -------
-    One number for each of :data:`LIMITS`, by name; ``flicker`` only of three frames or more.
+    ``before`` and ``after`` are the arm's states before the first and after the last exposure, ``rig`` counts the overlap,
+    ``frames`` ToF frames were asked for.
     """
     info = tof.info
     amplitude = np.abs(mean_phasors(tof.raw, info.modulation_hz, info.phase_rad)).min(axis=0)

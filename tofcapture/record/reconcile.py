@@ -16,18 +16,9 @@ from tofcapture.record.journal import Journal
 
 
 def reconcile(journal: Journal, recording: Path, scene: str) -> list[str]:
-    """Put right what a killed run, or a person, left behind of one scene.
+    """Put right what a killed run, or a person, left behind of one scene; say each thing in a sentence.
 
-    Parameters
-    ----------
-    journal, recording
-        Both held by this process.
-    scene
-        Its name.
-
-    Returns
-    -------
-    One sentence for each thing that was put right.
+    The process holds the recording.
     """
     folder, rows = view_path(recording, scene, 0).parent, journal.rows(scene)
     known = {row.index for row in rows if row.state == "sealed"}

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 
 from tofcapture import __version__
 from tofcapture.devices.clearance import route, stage_of
@@ -24,7 +25,7 @@ from tofcapture.record.observer import Observer
 from tofcapture.record.plan import Plan, PlannedView, plan_scene
 from tofcapture.record.quality import REFUSE, RETAKE, broken_limits, measure, quality_table
 from tofcapture.record.reconcile import reconcile
-from tofcapture.record.resources import check_space, full_disk_named, hold_arm, hold_recording
+from tofcapture.record.resources import check_space, full_disk_named, hold_arm, hold_file
 
 ATTEMPTS = 3  # at one view
 FAILURES_IN_A_ROW = 2  # that end the run: that is no bad pose, that is a broken device
@@ -34,32 +35,16 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class RecordResult:
-    """What a run of the recorder did.
-
-    Attributes
-    ----------
-    scene
-        Name.
-    recorded, kept, failed
-        Numbers of views: taken now, there already, given up.
-    reasons
-        One sentence for each failed view.
-    repaired
-        One sentence for each thing put right in the recording.
-    plan
-        The plan that was followed.
-    notes
-        One sentence for each thing that is not as it should be in a view taken now (``record.quality``).
-    """
+    """What a run of the recorder did: numbers of views, and sentences."""
 
     scene: str
-    recorded: tuple[int, ...]
-    kept: tuple[int, ...]
-    failed: tuple[int, ...]
-    reasons: tuple[str, ...]
-    repaired: tuple[str, ...]
+    recorded: tuple[int, ...]  # taken now
+    kept: tuple[int, ...]  # there already
+    failed: tuple[int, ...]  # given up
+    reasons: tuple[str, ...]  # one for each failed view
+    repaired: tuple[str, ...]  # what was put right in the recording
     plan: Plan
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what is not as it should be in views taken now (record.quality)
 
 
 def record(
@@ -92,7 +77,7 @@ def record(
     observer
         Looks on; may make the recorder wait between views, or end it.
     turns
-        In how many ways the object is put on the table (``record.plan``); the operator is asked to turn it.
+        In how many ways the operator is asked to put the object on the table.
 
     Raises
     ------
@@ -118,8 +103,12 @@ def record(
         )
     with full_disk_named(recording):
         recording.mkdir(parents=True, exist_ok=True)
-        _keep_configuration(recording, station)
-        with hold_recording(recording), hold_arm(station.arm), closing(Journal(recording)) as journal:
+        if not (copy := recording / "station.toml").exists():
+            write_text(copy, tomli_w.dumps(station.config))
+        busy = f"{recording}: another recorder is at work"
+        # Not the journal itself: closing any handle of it would drop SQLite's own locks.
+        lock = hold_file(recording / ".lock", busy, "wait for it to end")
+        with lock, hold_arm(station.arm), closing(Journal(recording)) as journal:
             journal.agree({"station": station.describe(), "frames": frames, "world": station.world})
             repaired = reconcile(journal, recording, scene)
             kept = journal.expect(scene, {view.index: view.digest for view in plan.views})
@@ -138,15 +127,6 @@ def record(
     return run.result(kept, repaired)
 
 
-def _keep_configuration(recording: Path, station: Station) -> None:
-    """Keep a copy of the station's configuration in the recording."""
-    import tomli_w
-
-    copy = recording / "station.toml"
-    if not copy.exists():
-        write_text(copy, tomli_w.dumps(station.config))
-
-
 @dataclass
 class _Run:
     """One run over the views of a scene: what stays the same from view to view, and what came of them."""
@@ -162,7 +142,7 @@ class _Run:
     failed_in_a_row: int = 0
     recorded: list[int] = field(default_factory=list)
     reasons: dict[int, str] = field(default_factory=dict)
-    notes: dict[int, list[str]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
     def place_object(self, planned: PlannedView) -> None:
         """Have the object put on the table, and turned where the plan turns it."""
@@ -173,50 +153,32 @@ class _Run:
         self.turned = planned.turn
 
     def take(self, planned: PlannedView) -> None:
-        """Take and seal one view, or give it up.
+        """Move, expose, check and seal, in three attempts at most; else give the view up.
 
         Raises
         ------
         DeviceError
             This view and the one before it failed.
         """
-        try:
-            self.seal(self.expose_until_good(planned))
-        except DeviceError as err:
-            # An arm that was told to stop refuses to move: the observer says so, that is no failure of the view.
-            self.observer.step(planned.index, "failed")
-            self.journal.fail(self.scene, planned.index, err.message)
-            self.observer.failed(planned.index, err.message)
-            self.reasons[planned.index] = err.message
-            self.failed_in_a_row += 1
-            if self.failed_in_a_row >= FAILURES_IN_A_ROW:
-                raise
-        else:
-            self.recorded.append(planned.index)
-            self.failed_in_a_row = 0
-
-    def expose_until_good(self, planned: PlannedView) -> View:
-        """Move, expose and check, three times at most; a refused motion is refused for good."""
         for attempt in range(1, ATTEMPTS + 1):
             self.journal.attempt(self.scene, planned.index)
             try:
                 before = self.move(planned)
                 tof, stereo, after = self.expose(planned)
                 numbers = self.check(tof, stereo, before, after)
-            except MotionRefused:
-                raise
-            except DeviceError:
-                if attempt == ATTEMPTS:
-                    raise
+            except DeviceError as err:
+                # A refused motion is refused for good.
+                if attempt == ATTEMPTS or isinstance(err, MotionRefused):
+                    self.give_up(planned.index, err)
+                    return
                 continue
             broken = broken_limits(numbers)
             if attempt == ATTEMPTS or not any(limit.action == RETAKE for limit in broken):
                 break
-        if broken:
-            self.notes[planned.index] = [limit.sentence(numbers) for limit in broken]
+        self.notes += [f"view {planned.index}: {limit.sentence(numbers)}" for limit in broken]
         provenance = {**self.provenance(planned), "quality": quality_table(numbers)}
         truth, rig = self.station.operator.truth(), self.station.rig
-        return View(self.scene, planned.index, tof, stereo, before, after, rig, provenance, truth)
+        self.seal(View(self.scene, planned.index, tof, stereo, before, after, rig, provenance, truth))
 
     def move(self, planned: PlannedView) -> ArmState:
         """Move by a clear way; the arm returns settled."""
@@ -251,6 +213,19 @@ class _Run:
         digest = write_view(view_path(self.recording, self.scene, view.index), view)
         self.journal.seal(self.scene, view.index, digest)
         self.observer.sealed(view, digest)
+        self.recorded.append(view.index)
+        self.failed_in_a_row = 0
+
+    def give_up(self, index: int, error: DeviceError) -> None:
+        """Note that a view failed; raise when the one before it failed too."""
+        # An arm that was told to stop refuses to move: the observer says so, that is no failure of the view.
+        self.observer.step(index, "failed")
+        self.journal.fail(self.scene, index, error.message)
+        self.observer.failed(index, error.message)
+        self.reasons[index] = error.message
+        self.failed_in_a_row += 1
+        if self.failed_in_a_row >= FAILURES_IN_A_ROW:
+            raise error
 
     def begin(self, index: int, step: str) -> None:
         """Journal a step of a view, before anything is done."""
@@ -284,5 +259,5 @@ class _Run:
             reasons=tuple(f"view {i}: {self.reasons[i]}" for i in sorted(self.reasons)),
             repaired=tuple(repaired),
             plan=self.plan,
-            notes=tuple(f"view {i}: {note}" for i in sorted(self.notes) for note in self.notes[i]),
+            notes=tuple(self.notes),
         )

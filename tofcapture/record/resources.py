@@ -93,20 +93,6 @@ def hold_file(path: Path, what: str, hint: str) -> Iterator[None]:
 
 
 @contextmanager
-def hold_recording(recording: Path) -> Iterator[None]:
-    """Hold a recording for writing.
-
-    Raises
-    ------
-    BusyError
-        Another recorder holds it.
-    """
-    # Not the database itself: closing any handle of it would drop SQLite's own locks.
-    with hold_file(recording / ".lock", f"{recording}: another recorder is at work", "wait for it to end"):
-        yield
-
-
-@contextmanager
 def hold_arm(arm: Arm) -> Iterator[None]:
     """Hold a real arm for this process: two recorders of two recordings must not move it in turn.
 

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar
 
 from aiohttp import web
 
@@ -19,7 +19,6 @@ from tofcapture.errors import UsageError
 from tofcapture.record.daemon.events import Streams
 from tofcapture.record.daemon.guard import BODY_LIMIT, Guard, Handler, body_of
 from tofcapture.record.daemon.preview import NAMES
-from tofcapture.record.daemon.store import Job
 from tofcapture.record.daemon.supervisor import Supervisor
 
 PAGE = Path(__file__).with_name("page")
@@ -33,88 +32,10 @@ PAGE_FILES = {
 _STREAM = "/v1/events"
 
 Schema = dict[str, Any]
-_TYPES = {int: ["integer"], str: ["string"], int | None: ["integer", "null"], str | None: ["string", "null"]}
-
-
-def _object(required: str = "", /, **properties: Schema) -> Schema:
-    out: Schema = {"type": "object", "properties": properties}
-    return {**out, "required": required.split()} if required else out
-
-
-def _name(description: str) -> Schema:
-    return {"type": "string", "pattern": r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$", "description": description}
-
-
-def _number(low: int, high: int, **more: Any) -> Schema:
-    return {"type": "integer", "minimum": low, "maximum": high, **more}
-
-
-def _ref(name: str) -> Schema:
-    return {"$ref": f"#/components/schemas/{name}"}
-
-
-_NOTHING_ELSE = {"additionalProperties": False}
-JOB_REQUEST = _NOTHING_ELSE | _object(
-    "scene recording",
-    scene=_name("what stands on the table; 'calibration' for the board"),
-    recording=_name("folder under the daemon's root"),
-    views=_number(1, 1000, default=25),
-    frames=_number(1, 1000, default=10),
-    seed=_number(0, 2**31 - 1, description="of the simulated station"),
-    request_id=_name("made by the client; asking twice queues once"),
-)
-_JOB = _object(
-    " ".join(get_type_hints(Job)),
-    **{key: {"type": _TYPES[kind]} for key, kind in get_type_hints(Job).items() if key != "state"},
-    state={"enum": ["queued", "running", "done", "failed", "stopped"]},
-)
-_TEXT: Schema = {"type": "string"}
-SCHEMAS = {
-    "Error": _object("error", error=_object("kind message hint", kind=_TEXT, message=_TEXT, hint=_TEXT)),
-    "Job": _JOB,
-    "Jobs": _object("jobs", jobs={"type": "array", "items": _ref("Job")}),
-    "JobRequest": JOB_REQUEST,
-    "Nothing": _NOTHING_ELSE | _object(),
-    "Page": _object("url", url={"type": ["string", "null"]}),
-    "State": _object(
-        "version phase reason job progress doing queue health last_event",
-        phase={"enum": ["idle", "recording", "pausing", "paused", "stopping"]},
-        reason=_TEXT,
-        job={"oneOf": [_ref("Job"), {"type": "null"}]},
-        progress={"type": "object"},
-        root=_TEXT,
-        last_event={"type": "integer"},
-    ),
-    "Views": _object("job views", views={"type": "array", "items": {"type": "object"}}),
-    "Document": _object(),
-}
-ERRORS = {
-    400: "the body is no JSON object, or a parameter is wrong",
-    401: "no token, or a wrong one (TCP only)",
-    403: "foreign Host or Origin, another user, or the header X-Tofcapture is missing",
-    404: "there is no such thing",
-    408: "the body came too slowly",
-    409: "it contradicts what was asked before, or the queue is full",
-    413: "the body is larger than 64 KiB",
-    415: "the body is not application/json",
-    422: "a field is missing, unknown, or has a wrong value",
-    503: "too many event streams",
-}
-PARAMETERS: dict[str, Schema] = {
-    "number": {"in": "path", "required": True, "schema": _number(1, 2**53)},
-    "name": {"in": "path", "required": True, "schema": {"enum": list(NAMES)}},
-    "after": {
-        "in": "query",
-        "schema": _number(0, 2**53),
-        "description": "start behind this event; the header Last-Event-ID does the same",
-    },
-    "X-Tofcapture": {
-        "in": "header",
-        "required": True,
-        "schema": {"type": "string", "enum": ["1"]},
-        "description": "no page of another site can send it unasked",
-    },
-}
+_TOLD = json.loads(Path(__file__).with_name("api.json").read_text(encoding="utf-8"))
+SCHEMAS: Schema = _TOLD["schemas"]  # of bodies and answers
+ERRORS: Schema = _TOLD["errors"]  # what each code means
+PARAMETERS: Schema = _TOLD["parameters"]  # of paths, queries and headers
 
 
 def check(schema: Mapping[str, Any], value: Any, where: str = "body") -> None:
@@ -151,8 +72,7 @@ def check(schema: Mapping[str, Any], value: Any, where: str = "body") -> None:
 class Route:
     """Something that may be asked: served by ``handler``, a method of :class:`Api`, and documented by its docstring.
 
-    ``answer`` names a schema or a media type. ``body`` names the schema of the body, which every POST has. ``codes`` are the
-    answers besides 200 and the errors of every route.
+    ``answer`` names a schema or a media type, ``body`` a schema; every POST has one. ``codes`` come besides the usual ones.
     """
 
     method: str
@@ -166,25 +86,20 @@ class Route:
         """Write the route's OpenAPI operation."""
         named = re.findall(r"{(\w+)}", self.path) + (["after"] if self.path == _STREAM else [])
         usual = (200, 400, 401, 403, 408, 413, 415, 422) if self.body else (200, 401, 403)
-        known = self.answer in SCHEMAS
-        media, schema = ("application/json", _ref(self.answer)) if known else (self.answer, _TEXT)
-        answer = {"description": self.answer, "content": {media: {"schema": schema}}}
-        error = {"application/json": {"schema": _ref("Error")}}
         codes = sorted({*usual, *self.codes, *([404] if "{" in self.path else [])})
+        answer = _content(self.answer)
         out: Schema = {
             "summary": (self.handler.__doc__ or "").rstrip("."),
             "responses": {
-                str(code): {"description": ERRORS[code], "content": error} if code in ERRORS else answer
+                str(code): {"description": ERRORS.get(str(code), self.answer)}
+                | (answer if code < 400 else _content("Error"))
                 for code in codes
             },
             "parameters": [
                 {"name": key, **PARAMETERS[key]} for key in (["X-Tofcapture"] if self.body else []) + named
             ],
         }
-        if self.body:
-            content = {"application/json": {"schema": _ref(self.body)}}
-            out["requestBody"] = {"required": True, "content": content}
-        return out
+        return out | ({"requestBody": {"required": True, **_content(self.body)}} if self.body else {})
 
     def bind(self, api: Api) -> Handler:
         """Make the handler that aiohttp calls; it checks what was given against the schemas."""
@@ -199,6 +114,13 @@ class Route:
             return answer if isinstance(answer, web.Response) else web.json_response(answer)
 
         return handle
+
+
+def _content(what: str) -> Schema:
+    """A body of a schema, in JSON, or of a media type."""
+    if what in SCHEMAS:
+        return {"content": {"application/json": {"schema": {"$ref": f"#/components/schemas/{what}"}}}}
+    return {"content": {what: {"schema": {"type": "string"}}}}
 
 
 ROUTES: list[Route] = []
@@ -320,24 +242,23 @@ class Api:
     @route("GET", "/metrics", "text/plain")
     def metrics(self) -> web.Response:
         """Numbers for Prometheus."""
-        found = self._do.snapshot()
-        health, counters = found["health"], self._do.counters
-        plain = {
+        found, counters = self._do.snapshot(), self._do.counters
+        values = {
             "views_sealed_total": counters["sealed"],
             "views_failed_total": counters["failed"],
-            "recorder_restarts_total": health["restarts"],
-            "recorder_up": int(health["recorder"] == "alive"),
+            "recorder_restarts_total": counters["restarts"],
+            "recorder_up": int(found["health"]["recorder"] == "alive"),
             "paused": int(found["phase"] == "paused"),
-            "disk_free_bytes": health["disk_free_bytes"] or 0,
+            "disk_free_bytes": found["health"]["disk_free_bytes"] or 0,
             "event_streams": len(self._streams),
+            **{f'jobs{{state="{state}"}}': n for state, n in found["queue"].items()},
+            **{f'http_responses_total{{code="{code}"}}': n for code, n in self._guard.codes.items()},
         }
-        values = {name: {"": value} for name, value in plain.items()}
-        values["jobs"] = {f'{{state="{state}"}}': n for state, n in found["queue"].items()}
-        values["http_responses_total"] = {f'{{code="{c}"}}': n for c, n in self._guard.codes.items()}
+        kinds = {name.partition("{")[0]: "counter" if "_total" in name else "gauge" for name in values}
         lines = []
-        for name, labelled in values.items():
-            lines.append(f"# TYPE tofcapture_{name} {'counter' if name.endswith('_total') else 'gauge'}")
-            lines += [f"tofcapture_{name}{label} {value}" for label, value in labelled.items()]
+        for name, kind in kinds.items():
+            lines.append(f"# TYPE tofcapture_{name} {kind}")
+            lines += [f"tofcapture_{key} {n}" for key, n in values.items() if key.partition("{")[0] == name]
         return web.Response(text="\n".join(lines) + "\n", content_type="text/plain")
 
 
@@ -354,19 +275,14 @@ def document() -> Schema:
     paths: dict[str, Schema] = {}
     for known in ROUTES:
         paths.setdefault(known.path, {})[known.method.lower()] = known.document()
+    words = "Records scenes, one after the other; over a Unix socket, or loopback TCP with a token."
+    token = {"token": {"type": "http", "scheme": "bearer"}}
     return {
         "openapi": "3.1.0",
-        "info": {
-            "title": "tofcapture daemon",
-            "version": __version__,
-            "summary": "Records scenes, one after the other; over a Unix socket, or loopback TCP with a token.",
-        },
+        "info": {"title": "tofcapture daemon", "version": __version__, "summary": words},
         "paths": paths,
         "security": [{"token": []}],
-        "components": {
-            "schemas": SCHEMAS,
-            "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
-        },
+        "components": {"schemas": SCHEMAS, "securitySchemes": token},
     }
 
 

@@ -30,14 +30,7 @@ class _UnixConnection(http.client.HTTPConnection):
 def ask(
     method: str, path: str, body: Mapping[str, Any] | None = None, state: Path | None = None
 ) -> dict[str, Any]:
-    """Ask the daemon.
-
-    Parameters
-    ----------
-    method, path, body
-        For example ``"POST", "/v1/jobs", {"scene": "mug", "recording": "mugs"}``.
-    state
-        The daemon's folder; the default one for ``None``.
+    """Ask the daemon whose folder is ``state`` (default: the user's): ``ask("POST", "/v1/jobs", {"scene": ...})``.
 
     Raises
     ------
@@ -67,16 +60,7 @@ def ask(
 
 
 def hand_over(recording: Path, job: Mapping[str, Any], state: Path | None = None) -> dict[str, Any] | None:
-    """Queue a scene with the daemon that keeps a recording.
-
-    Parameters
-    ----------
-    recording
-        Folder to record into.
-    job
-        ``scene``, ``views``, ``frames``, and ``seed`` when it is given.
-    state
-        The daemon's folder; the default one for ``None``.
+    """Queue a scene (``scene``, ``views``, ``frames``, perhaps ``seed``) with the daemon that keeps a recording.
 
     Returns
     -------

@@ -66,22 +66,17 @@ class Streams:
         for event in self._store.events(last) if after is not None else ():
             await _write(response, event.text())
             last = event.id
-        while (items := await _next(queue)) is not None:
-            if text := b"".join(text for number, text in items if number == 0 or number > last):
+        while True:
+            try:
+                async with asyncio.timeout(_QUIET):
+                    item = await queue.get()
+            except TimeoutError:
+                item = (0, b": alive\n\n")
+            if item is None:
+                return
+            number, text = item
+            if number == 0 or number > last:
                 await _write(response, text)
-
-
-async def _next(queue: _Queue) -> list[tuple[int, bytes]] | None:
-    """Take all events that wait; a comment when there are none for a while, ``None`` when the stream ends."""
-    items: list[tuple[int, bytes] | None] = []
-    try:
-        async with asyncio.timeout(_QUIET):
-            items.append(await queue.get())
-    except TimeoutError:
-        return [(0, b": alive\n\n")]
-    while not queue.empty():
-        items.append(queue.get_nowait())
-    return None if None in items else [item for item in items if item is not None]
 
 
 def _end(queue: _Queue) -> None:

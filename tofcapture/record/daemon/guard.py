@@ -51,15 +51,7 @@ def refusal(
 
 
 class Guard:
-    """Stands before every handler.
-
-    Parameters
-    ----------
-    token
-        What TCP clients must show.
-    open_paths
-        Given without a token: the files of the page, which say nothing.
-    """
+    """Stands before every handler: TCP clients must show the token, but for the files of the page, which say nothing."""
 
     def __init__(self, token: str, open_paths: frozenset[str]) -> None:
         self._token, self._open_paths = token, open_paths

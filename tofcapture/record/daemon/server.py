@@ -54,16 +54,9 @@ def tcp_address(text: str) -> Address:
 
 
 def serve(settings: Settings, http: Address | None, announce: Callable[[str | None], None]) -> None:
-    """Run until SIGTERM or SIGINT.
+    """Run until SIGTERM or SIGINT; listen on a loopback address too, where port 0 takes a free one.
 
-    Parameters
-    ----------
-    settings
-        See there.
-    http
-        Loopback address to listen on too; port 0 takes a free one.
-    announce
-        Called when everything listens, with the page's address, token included, or ``None`` without TCP.
+    ``announce`` is called when everything listens, with the page's address, token included, or ``None`` without TCP.
 
     Raises
     ------

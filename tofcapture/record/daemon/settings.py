@@ -16,64 +16,28 @@ from tofcapture.record.resources import hold_file
 _SOCKET_LIMIT = 107  # bytes of a Unix socket's path that Linux takes
 
 
-@dataclass(frozen=True)
 class StateFolder:
-    """Paths in the daemon's folder, all of them for its user alone."""
+    """Paths in the daemon's folder ``root``, all of them for its user alone."""
 
-    root: Path
-
-    @property
-    def socket(self) -> Path:
-        """Where the API listens."""
-        return self.root / "daemon.sock"
-
-    @property
-    def database(self) -> Path:
-        """Queue and events."""
-        return self.root / "queue.sqlite"
-
-    @property
-    def previews(self) -> Path:
-        """Latest pictures."""
-        return self.root / "preview"
-
-    @property
-    def token(self) -> Path:
-        """The secret that a TCP client must show."""
-        return self.root / "token"
-
-    @property
-    def socket_fits(self) -> bool:
-        """Whether the socket's path is short enough for one."""
-        return len(os.fsencode(self.socket)) <= _SOCKET_LIMIT
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.socket = root / "daemon.sock"  # where the API listens
+        self.database = root / "queue.sqlite"  # queue and events
+        self.previews = root / "preview"  # latest pictures
+        self.token = root / "token"  # the secret that a TCP client must show
+        self.socket_fits = len(os.fsencode(self.socket)) <= _SOCKET_LIMIT
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the daemon was started with.
+    """What the daemon was started with."""
 
-    Attributes
-    ----------
-    root
-        Folder of recordings; a job names a folder in it.
-    state
-        The daemon's own folder.
-    station
-        ``station.toml``; ``None`` for the embedded simulated station.
-    allow_motion
-        A real arm may move.
-    worker
-        Command of the recorder's process.
-    silence_limit
-        Seconds without a sign of life after which a recorder is killed.
-    """
-
-    root: Path
+    root: Path  # of recordings; a job names a folder in it
     state: StateFolder
-    station: Path | None = None
-    allow_motion: bool = False
+    station: Path | None = None  # station.toml; None: the embedded simulated station
+    allow_motion: bool = False  # a real arm may move
     worker: Sequence[str] = (sys.executable, "-m", "tofcapture.record.daemon.worker")
-    silence_limit: float = 20.0
+    silence_limit: float = 20.0  # s without a sign of life after which a recorder is killed
 
 
 def state_folder(root: Path | None) -> StateFolder:

@@ -156,17 +156,7 @@ class Progress:
 
 
 class Supervisor:
-    """Works on the queue until closed.
-
-    Parameters
-    ----------
-    settings
-        See there.
-    store
-        Queue and events; what was running when the last daemon died waits, paused, for a person.
-    publish
-        Called with every event.
-    """
+    """Works on the queue until closed; what was running when the last daemon died waits, paused, for a person."""
 
     def __init__(self, settings: Settings, store: Store, publish: Callable[[Event], None]) -> None:
         self.settings, self.store, self._publish = settings, store, publish
@@ -181,8 +171,6 @@ class Supervisor:
             if job.state == "running":
                 store.move(job.id, "queued")
             self.reason = "the daemon was started with work waiting: look at the station, then resume"
-
-    # What people ask for -------------------------------------------------------------------------------------------
 
     def add(self, request: Mapping[str, Any]) -> tuple[Job, bool]:
         """Queue a job; see :meth:`Store.add`."""
@@ -233,8 +221,6 @@ class Supervisor:
     def _order(self, verb: str) -> None:
         if self._recorder:
             self._recorder.order(verb)
-
-    # What it works on ----------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
         """Work until closed."""
@@ -339,8 +325,6 @@ class Supervisor:
             reason = " - ".join(filter(None, [last.get("message"), last.get("hint")]))
             self.store.move(job.id, "queued")
             self.reason = self.reason or reason or "the recorder died: look at the station, then resume"
-
-    # What it tells -------------------------------------------------------------------------------------------------
 
     @property
     def phase(self) -> str:

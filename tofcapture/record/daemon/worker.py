@@ -32,11 +32,11 @@ _LAST_WORDS = 2.0  # s that the recorder has to notice that it shall end
 _PATIENCE = 1800.0  # s that an operator may take to place a scene
 
 
-class Link:
-    """Both ends of the line to the daemon: text files of one JSON object a line."""
+class DaemonLink(Observer):
+    """The line to the daemon: tells it what the recorder does, and does what it orders."""
 
-    def __init__(self, orders: TextIO, out: TextIO) -> None:
-        self._orders, self._out = orders, out
+    def __init__(self, orders: TextIO, out: TextIO, previews: Path) -> None:
+        self._orders, self._out, self._previews = orders, out, previews
         self._lock = threading.Lock()
         self._changed = threading.Condition()
         self.paused = self.stopped = self.confirmed = False
@@ -73,17 +73,6 @@ class Link:
         if self.stopped:
             raise Stopped("stopped by the operator", hint="ask for the same scene again to go on")
 
-    def rest(self) -> None:
-        """Wait while paused."""
-        self.check()
-        if not self.paused:
-            return
-        self.tell("paused")
-        with self._changed:
-            self._changed.wait_for(lambda: self.stopped or not self.paused)
-        self.check()
-        self.tell("resumed")
-
     def ask(self, scene: str) -> None:
         """Wait until a person says that the scene is placed.
 
@@ -110,24 +99,6 @@ class Link:
             self.tell("alive")
             threading.Event().wait(ALIVE)
 
-
-class PageOperator(Operator):
-    """The person at the page, who puts scenes on the table when asked."""
-
-    def __init__(self, link: Link) -> None:
-        self._link = link
-
-    def place(self, scene: str) -> None:
-        """Ask and wait."""
-        self._link.ask(scene)
-
-
-class Reporter(Observer):
-    """Tells the daemon what the recorder does; passes pause and stop on to it."""
-
-    def __init__(self, link: Link, previews: Path) -> None:
-        self._link, self._previews = link, previews
-
     def planned(self, plan: Plan, kept: set[int], repaired: list[str]) -> None:
         """Tell the plan."""
         views = [
@@ -139,16 +110,24 @@ class Reporter(Observer):
             }
             for v in plan.views
         ]
-        self._link.tell("planned", views=views, wanted=plan.wanted, repaired=repaired)
+        self.tell("planned", views=views, wanted=plan.wanted, repaired=repaired)
 
-    def before_view(self, index: int) -> None:  # noqa: ARG002
-        """Rest while paused."""
-        self._link.rest()
+    def before_view(self, index: int) -> None:
+        """Wait while paused."""
+        del index
+        self.check()
+        if not self.paused:
+            return
+        self.tell("paused")
+        with self._changed:
+            self._changed.wait_for(lambda: self.stopped or not self.paused)
+        self.check()
+        self.tell("resumed")
 
     def step(self, index: int, step: str) -> None:
         """Tell the step, unless it must not be taken any more."""
-        self._link.check()
-        self._link.tell("step", index=index, step=step)
+        self.check()
+        self.tell("step", index=index, step=step)
 
     def sealed(self, view: View, sha256: str) -> None:
         """Tell what a view is like; pictures that cannot be made are no reason to lose a recording."""
@@ -159,15 +138,26 @@ class Reporter(Observer):
             save(view, self._previews)
             found = quality(view)
         except (OSError, TofError, ValueError) as err:
-            self._link.tell("log", text=f"no preview of view {view.index}: {err}")
-        self._link.tell("sealed", index=view.index, sha256=sha256, quality=found)
+            self.tell("log", text=f"no preview of view {view.index}: {err}")
+        self.tell("sealed", index=view.index, sha256=sha256, quality=found)
 
     def failed(self, index: int, reason: str) -> None:
         """Tell why a view was given up."""
-        self._link.tell("failed", index=index, reason=reason)
+        self.tell("failed", index=index, reason=reason)
 
 
-def _work(job: Mapping[str, Any], link: Link) -> dict[str, Any]:
+class PageOperator(Operator):
+    """The person at the page, who puts scenes on the table when asked."""
+
+    def __init__(self, link: DaemonLink) -> None:
+        self._link = link
+
+    def place(self, scene: str) -> None:
+        """Ask and wait."""
+        self._link.ask(scene)
+
+
+def _work(job: Mapping[str, Any], link: DaemonLink) -> dict[str, Any]:
     """Open the station, record, and say what came of it."""
     # Imported late: orders are followed, and signs of life given, while the libraries load.
     from tofcapture.devices.station import open_station
@@ -180,10 +170,7 @@ def _work(job: Mapping[str, Any], link: Link) -> dict[str, Any]:
         check_motion_allowed(station, job["allow_motion"], hint)
         link.tell("opened", station=station.describe(), simulated=station.simulated)
         staffed = replace(station, operator=PageOperator(link)) if station.operator.person else station
-        reporter = Reporter(link, Path(job["previews"]))
-        result = record(
-            staffed, job["scene"], job["recording"], job["views"], job["frames"], observer=reporter
-        )
+        result = record(staffed, job["scene"], job["recording"], job["views"], job["frames"], observer=link)
     return {"failed": list(result.failed), "reasons": list(result.reasons)}
 
 
@@ -203,7 +190,7 @@ def main() -> None:
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     job = json.loads(sys.stdin.readline())
-    link = Link(sys.stdin, out)
+    link = DaemonLink(sys.stdin, out, Path(job["previews"]))
     for task in (link.listen, link.show_life):
         threading.Thread(target=task, daemon=True).start()
     try:
