@@ -108,6 +108,17 @@ def test_describe_needs_an_opening_or_a_table(tmp_path):
         SerialTof({}, StationContext({}, tmp_path))
 
 
+def test_description_file_that_cannot_be_used(modules, tmp_path):
+    """A file of what the module said that is damaged, or cannot be written, is named with what to do."""
+    (tmp_path / "tof-description.toml").write_text("model = [")
+    with pytest.raises(ConfigError, match="cannot read what the camera said") as caught:
+        camera("/dev/nowhere", tmp_path).describe()
+    assert "delete it" in caught.value.hint
+    with pytest.raises(ConfigError, match="cannot write what the camera said") as caught:
+        camera(modules(), tmp_path, description="/proc/none/tof.toml").__enter__()
+    assert "description" in caught.value.hint
+
+
 def test_station_overrides_intrinsics(modules, tmp_path):
     """Measured intrinsics in station.toml win over the module's own."""
     mine = {"width": 24, "height": 18, "fx": 20.5, "fy": 21.5, "cx": 11.0, "cy": 9.0}

@@ -4,6 +4,7 @@ import contextlib
 import json
 import tracemalloc
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from tests.tof_module.module import Noise
 from tests.tof_module.synthetic import whitened
 from tests.tof_module.vectors import vectors
 from tofcapture.devices.tof_serial import messages
-from tofcapture.devices.tof_serial.clock import Anchor, anchor, drift, to_host
+from tofcapture.devices.tof_serial.clock import Anchor, ClockError, anchor, burst_times, drift, to_host
 from tofcapture.devices.tof_serial.messages import MalformedError
 from tofcapture.devices.tof_serial.packet import Kind, Packet, Parser, decode, encode
 from tofcapture.devices.tof_serial.pixels import Assembly, pack12, packed_size, unpack12, values
@@ -213,3 +214,32 @@ def test_clock_within_its_bound(rate, offset_us, seed):
     bound = near.error_ns + 2000 + 1e9 * (anchors[0].error_ns + anchors[2].error_ns) / 600e9
     assert abs(to_host(near, drift(anchors[0], anchors[2]), module(true)) - true) <= bound
     assert drift(anchors[1], Anchor(anchors[1].host_ns + 10**9, anchors[1].module_us + 10**6, 0)) == 0.0
+
+
+SECOND = 10**9
+ANCHORS = [Anchor(at * SECOND, at * 10**6, 10_000) for at in (0, 10, 11)]  # host and module run alike
+
+
+def test_times_of_a_burst():
+    """Frames have the host's times of their exposures, from a clock that runs as a crystal does."""
+    assert burst_times(ANCHORS, [10_100_000, 10_133_333], 33_333).tolist() == [10_100_000_000, 10_133_333_000]
+    drifting = [replace(a, module_us=round(a.module_us * 1.0002)) for a in ANCHORS]
+    (found,) = burst_times(drifting, [round(10_100_000 * 1.0002)], 33_333)
+    assert abs(found - 10_100_000_000) < 2000
+
+
+@pytest.mark.parametrize(
+    ("stretch", "clocks", "words"),
+    [
+        (1.001, [10_100_000], "runs off by -999 ppm"),
+        (1.0, [10_200_000, 10_100_000], "in order within the burst"),
+        (1.0, [9_900_000, 10_100_000], "in order within the burst"),
+        (1.0, [10_100_000, 11_100_000], "in order within the burst"),
+    ],
+)
+def test_clocks_that_no_crystal_has_are_named(stretch, clocks, words):
+    """A clock that drifts too far, and frames before, after or out of order in their burst, are refused."""
+    anchors = [replace(a, module_us=round(a.module_us * stretch)) for a in ANCHORS]
+    with pytest.raises(ClockError, match=words) as caught:
+        burst_times(anchors, clocks, 33_333)
+    assert caught.value.hint

@@ -115,11 +115,13 @@ def test_killed_driver(emulator, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_station(emulator, tmp_path):
-    """SIGKILL of the station's process in mid-move stops the arm on its way; the next run goes on."""
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_lost_station(emulator, tmp_path, how):
+    """A station's process that dies or falls silent in mid-move stops the arm on its way; the next run goes on."""
     file = station_file(tmp_path, emulator)
     with open_station(file, allow_motion=True) as station:
         at_home(station.arm)
+    emulator.order("slow", speed=0.2)  # slow enough that the arm does not arrive before silence is noticed
     program = (
         "import sys; from pathlib import Path; from tofcapture.devices.station import open_station\n"
         f"with open_station(Path({str(file)!r}), allow_motion=True) as s: s.arm.move_to({THERE.tolist()})"
@@ -128,8 +130,10 @@ def test_killed_station(emulator, tmp_path):
     while not emulator.order("status")["moving"]:
         time.sleep(0.02)
     time.sleep(0.3)
+    child.send_signal(how)
+    assert np.abs(np.array(emulator.rest(4.5)["joints"]) - THERE).max() > 0.1
     child.kill()
     child.wait()
-    assert np.abs(np.array(emulator.rest(3)["joints"]) - THERE).max() > 1e-3
+    emulator.calm()
     with open_station(file, allow_motion=True) as station:
         at_home(station.arm)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.devices import TofCamera
@@ -21,11 +20,11 @@ from tofcapture.devices.cameras import (
     write_description,
 )
 from tofcapture.devices.registry import check_keys
-from tofcapture.devices.tof_serial.clock import MOST_DRIFT, Anchor, drift, to_host
-from tofcapture.devices.tof_serial.messages import Frame, Info
+from tofcapture.devices.tof_serial.clock import Anchor, burst_times
+from tofcapture.devices.tof_serial.messages import Info
 from tofcapture.devices.tof_serial.pixels import values
 from tofcapture.devices.tof_serial.port import Port
-from tofcapture.devices.tof_serial.session import MS, ClockError, FirmwareError, LinkLostError, Session
+from tofcapture.devices.tof_serial.session import FirmwareError, LinkLostError, Session
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.frames import TofBurst, TofInfo
 from tofcapture.rig import camera_table
@@ -147,7 +146,7 @@ class SerialTof(ReopenedCamera, TofCamera):
         port.run(session.release())
         return TofBurst(
             raw=raw,
-            time_ns=_times(anchors, metas, module.period_us),
+            time_ns=burst_times(anchors, [meta.clock_us for meta in metas], module.period_us),
             celsius=np.array([meta.celsius for meta in metas]),
             info=self.describe(),
         )
@@ -195,21 +194,3 @@ def _check_firmware(info: Info, wanted: str | None) -> None:
             f"the module's firmware: expected {wanted}, got {found}",
             hint="flash that version, or change firmware in [tof] and begin a new recording",
         )
-
-
-def _times(anchors: list[Anchor], metas: list[Frame], period_us: int) -> NDArray[np.int64]:
-    """Host times (ns) of the exposures; refuses a clock that no crystal has, and times outside the burst."""
-    rate = drift(anchors[0], anchors[-1])
-    if abs(rate) > MOST_DRIFT:
-        raise ClockError(
-            f"the module's clock runs off by {rate * 1e6:.0f} ppm",
-            hint="its clock is not a crystal's, or it jumped",
-        )
-    near = min(anchors[1:], key=lambda a: a.error_ns)
-    times = np.array([to_host(near, rate, meta.clock_us) for meta in metas], dtype=np.int64)
-    low, high = anchors[1].host_ns - anchors[1].error_ns, anchors[2].host_ns + anchors[2].error_ns
-    if (np.diff(times) <= 0).any() or times[0] < low - MS or times[-1] > high + period_us * 1000:
-        raise ClockError(
-            "the frames' times do not lie in order within the burst", hint="the module's firmware is at fault"
-        )
-    return times

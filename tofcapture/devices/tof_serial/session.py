@@ -71,10 +71,6 @@ class ModuleRefusedError(DeviceError):
     """The module says no, or says something that the protocol does not allow."""
 
 
-class ClockError(DeviceError):
-    """The module's clock jumps or drifts beyond what a crystal does."""
-
-
 @dataclass(frozen=True)
 class Ask:
     """Send these bytes, then listen until packets come or the host clock says ``until`` (ns)."""
