@@ -16,6 +16,7 @@ import numpy as np
 
 from tofcapture.camera import Camera
 from tofcapture.devices import Arm, TofCamera
+from tofcapture.devices.faults import ProtectiveStop
 from tofcapture.errors import DeviceError, MotionRefused
 from tofcapture.frames import ArmInfo, ArmState, TofBurst, TofInfo
 from tofcapture.poses import Float64
@@ -33,7 +34,7 @@ def misbehave(how: str) -> None:
     Parameters
     ----------
     how
-        ``hang``, ``hang holding the lock``, ``crash``, ``exit``, ``raise``, ``refuse``, ``print``; empty for nothing.
+        ``hang``, ``hang holding the lock``, ``crash``, ``exit``, ``raise``, ``fault``, ``refuse``, ``print``; empty for nothing.
     """
     if how == "hang":
         time.sleep(_FOREVER)
@@ -45,6 +46,8 @@ def misbehave(how: str) -> None:
         os._exit(3)
     elif how == "raise":
         raise LookupError("VENDOR_STATUS_17")
+    elif how == "fault":
+        raise ProtectiveStop("the controller reports: protective stop")
     elif how == "refuse":
         raise DeviceError("the lens cap is on", hint="take it off")
     elif how == "print":

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests import misbehaving
-from tofcapture.devices.faults import HostLost
+from tofcapture.devices.faults import HostLost, ProtectiveStop
 from tofcapture.devices.host import hosted, process
 from tofcapture.devices.registry import StationContext
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
@@ -136,6 +136,19 @@ def test_a_lost_arm_is_not_replaced():
             with pytest.raises(HostLost, match="-11"):
                 call()
         arm.stop()
+    with arm:
+        assert arm.state().joints.shape == (6,)
+
+
+def test_a_fault_stays_until_the_station_is_opened_anew():
+    """A state that needs a person is repeated by every call, though the driver would answer; opening anew ends it."""
+    arm = hosted("arm", ARM)({"move": "fault"}, CONTEXT)
+    with arm:
+        assert arm.state().joints.shape == (6,)
+        for call in (lambda: arm.move_to(np.ones(6)), arm.state):
+            with pytest.raises(ProtectiveStop, match="protective stop") as caught:
+                call()
+            assert "acknowledge" in caught.value.hint
     with arm:
         assert arm.state().joints.shape == (6,)
 

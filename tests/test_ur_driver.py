@@ -31,6 +31,7 @@ def test_moves_measures_and_refuses(emulator, tmp_path):
     """It goes where it is told, reports the controller's pose, and refuses bad goals without moving."""
     with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
         at_home(station.arm)
+        emulator.order("slow", speed=0.35)  # the way takes longer than an arm may take to settle
         state = station.arm.move_to(THERE)
         np.testing.assert_allclose(state.joints, THERE, atol=4e-4)
         np.testing.assert_allclose(state.T_base_flange, forward(MODELS["ur10e"], state.joints), atol=1e-9)

@@ -2,6 +2,7 @@
 
 import struct
 import tomllib
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from tests.ur_emulator.robot import PLAYING, Robot
 from tests.ur_emulator.rtde_server import pack
 from tests.ur_emulator.script import ControlScript
 from tofcapture.devices import faults
-from tofcapture.devices.clearance import stage_of
+from tofcapture.devices.clearance import body_points, stage_of
 from tofcapture.devices.kinematics import HOME
 from tofcapture.devices.station import DEFAULT, open_station
 from tofcapture.devices.ur_rtde import probe as probing
@@ -148,6 +149,13 @@ def test_ways_are_checked():
     check_way(post, rig, stage, across, across + 1e-3)
     with pytest.raises(MotionRefused, match="keep_out 1"):
         check_way(post, rig, stage, start, across)
+    # Links and cameras have a girth: a box beside the flange is too close.
+    flange = body_points(SETTINGS.model, rig, HOME)[1][0]
+    for gap, refusal in ((0.07, pytest.raises(MotionRefused, match="keep_out 1")), (0.5, nullcontext())):
+        corner = flange + np.array([gap, 0.0, 0.0])
+        beside = replace(SETTINGS, keep_out=np.array([[corner, corner + 0.002]]))
+        with refusal:
+            check_way(beside, rig, stage, HOME, HOME + 1e-3)
     with pytest.raises(MotionRefused, match="table"):
         check_way(SETTINGS, rig, stage, HOME, _turned(2, 1.5))
 

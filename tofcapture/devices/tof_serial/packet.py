@@ -92,27 +92,15 @@ class Parser:
 
     def __init__(self) -> None:
         self._rest = bytearray()
-        self._skipping = False  # an endless piece is passed over until the next 0x00
 
     def feed(self, data: bytes) -> list[Packet]:
         """Take bytes, return the packets that they complete; never raises on any input."""
-        if b"\0" not in data:
-            self._keep(data)
-            return []
         *pieces, rest = data.split(b"\0")
-        pieces[0] = bytes(self._rest) + pieces[0]
-        self._rest.clear()
-        if self._skipping:
-            self._skipping, pieces[0] = False, b""
-        self._keep(rest)
+        if pieces:
+            pieces[0] = bytes(self._rest) + pieces[0]
+            self._rest.clear()
+        self._rest += rest
+        if len(self._rest) > _MAX_ENCODED:
+            self._rest.clear()  # no packet is that long; what follows up to the next 0x00 does not decode
         found = (decode(piece) for piece in pieces if piece and len(piece) <= _MAX_ENCODED)
         return [packet for packet in found if packet is not None]
-
-    def _keep(self, data: bytes) -> None:
-        """Hold the beginning of a packet, but never more than the longest one."""
-        if self._skipping:
-            return
-        self._rest += data
-        if len(self._rest) > _MAX_ENCODED:
-            self._rest.clear()
-            self._skipping = True
