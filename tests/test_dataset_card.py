@@ -7,10 +7,11 @@ import json
 import pytest
 
 from tests.test_files_shard import write
-from tofcapture.dataset.card import CONTEXT, write_card
+from tofcapture.dataset.card import CONTEXT, card_text, write_card
 from tofcapture.files.check import check
-from tofcapture.files.manifest import Manifest, SceneEntry, manifest_path, write_manifest
+from tofcapture.files.manifest import Manifest, SceneEntry, load_manifest, manifest_path, write_manifest
 from tofcapture.files.seal import sha256_of
+from tofcapture.files.shard import ShardReader
 
 SECTIONS = ("Motivation", "Composition", "Collection", "Preprocessing", "Uses", "Distribution", "Maintenance")
 
@@ -39,6 +40,31 @@ def test_the_card_is_a_datasheet(tmp_path):
     assert "{" not in text.replace('ShardReader("shards/box.h5")', "")
     measured = make(tmp_path / "second", exact=False) / "README.md"
     assert "Simulated" not in measured.read_text(encoding="utf-8")
+
+
+def test_the_numbers_of_the_card_are_those_of_the_data(tmp_path):
+    """Sizes, channels, bytes, the error of ground truth and the share of good pixels are said as they are."""
+    folder = make(tmp_path / "first")
+    manifest = load_manifest(folder)
+    gt = {"median_error_mm": 0.126, "p99_error_mm": 1.504, "coverage": 0.876}
+    text = card_text(folder, manifest, gt)
+    sizes, good, views = 0, 0, 0
+    for entry in manifest.scenes.values():
+        sizes += (folder / entry.path).stat().st_size
+        with ShardReader(folder / entry.path) as shard:
+            (H, W), (SH, SW) = shard.camera.shape, shard.rig.stereo.shape
+            counted = [v["good_pixels"] for v in shard.provenance.get("views", ())]
+            good, views = good + sum(counted), views + len(counted)
+            hz = sorted(set(shard.info.modulation_hz))
+            channels = f"{shard.frames} frames of {len(shard.info.modulation_hz)} phase images"
+    assert f"({W} x {H})" in text
+    assert f"({SW} x {SH})" in text
+    assert f"{channels} at {hz[0] / 1e6:g} and {hz[1] / 1e6:g} MHz" in text
+    assert f"{sizes / 1e6:.2f} MB in all; 3 objects by name" in text
+    assert "median 0.13 mm, 99th percentile 1.50 mm" in text
+    assert "which covers 88% of the object's pixels" in text
+    assert (f"{good / (4 * H * W * views):.0%}" if views else "An unknown share") in text
+    assert "Its error is not known" in card_text(folder, manifest, None)
 
 
 def test_card_and_description_name_the_scales(tmp_path):

@@ -82,8 +82,8 @@ def test_planted_outliers_are_named():
     ]
     assert outliers(views) == []
     views[7]["amplitude"], views[3]["good_share"] = 20.0, 0.0
-    assert {(o.view, o.name) for o in outliers(views)} == {(7, "amplitude"), (3, "good_share")}
-    assert [(o.view, o.name) for o in outliers(views[:5])] == [(3, "good_share")]
+    assert {(o["view"], o["name"]) for o in outliers(views)} == {(7, "amplitude"), (3, "good_share")}
+    assert [(o["view"], o["name"]) for o in outliers(views[:5])] == [(3, "good_share")]
     assert outliers([]) == []
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -127,26 +127,14 @@ class SplitStats:
 
 
 @dataclass(frozen=True)
-class Outlier:
-    """A number of a view that stands out: its value, the median of all views, robust standard deviations between."""
-
-    scene: str
-    view: int
-    name: str
-    value: float
-    median: float
-    deviations: float
-
-
-@dataclass(frozen=True)
 class DatasetStats:
-    """Statistics of a dataset: by split, by view, and the outliers."""
+    """Statistics of a dataset: by split, by view, and the :func:`outliers`."""
 
     dataset: Path
     manifest_sha256: str
     splits: Mapping[str, SplitStats]
     views: Sequence[Mapping[str, Any]]
-    outliers: Sequence[Outlier]
+    outliers: Sequence[Mapping[str, Any]]
 
     def table(self) -> dict[str, Any]:
         """As JSON types; numbers that are not finite become null."""
@@ -160,7 +148,7 @@ class DatasetStats:
             "dataset": str(self.dataset),
             "manifest_sha256": self.manifest_sha256,
             "splits": {name: split.table() for name, split in self.splits.items()},
-            "outliers": [asdict(o) for o in self.outliers],
+            "outliers": list(self.outliers),
             "views": rows,
         }
 
@@ -222,20 +210,16 @@ def incidence_deg(normals: Array, rays: Array) -> Array:
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def outliers(views: Sequence[Mapping[str, Any]]) -> list[Outlier]:
+def outliers(views: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Find views that stand out in a number, largest deviation first.
 
-    A number stands out when it is more than :data:`STANDS_OUT` robust standard deviations (1.4826 times the median absolute
+    Each is ``scene``, ``view``, ``name``, ``value``, ``median`` of all views, and ``deviations`` from it. A number stands out when it is more than :data:`STANDS_OUT` robust standard deviations (1.4826 times the median absolute
     deviation, with a floor for each number) from the median of all views. A view without a good pixel always does.
     """
     if not views:
         return []
     middle = float(np.median([row["good_share"] for row in views]))
-    found = [
-        Outlier(row["scene"], row["view"], "good_share", 0.0, middle, -_WORST)
-        for row in views
-        if row["good_share"] == 0
-    ]
+    found = [_outlier(row, "good_share", middle, -_WORST) for row in views if row["good_share"] == 0]
     for name in [k for k, v in views[0].items() if isinstance(v, float)] if len(views) >= FEWEST else ():
         values = np.array([row[name] for row in views])
         if not np.isfinite(values).any():
@@ -245,5 +229,10 @@ def outliers(views: Sequence[Mapping[str, Any]]) -> list[Outlier]:
         for row, value in zip(views, values, strict=True):
             z = (value - median) / scale
             if abs(z) > STANDS_OUT and not (name == "good_share" and value == 0):
-                found.append(Outlier(row["scene"], row["view"], name, float(value), median, float(z)))
-    return sorted(found, key=lambda o: -abs(o.deviations))
+                found.append(_outlier(row, name, median, float(z)))
+    return sorted(found, key=lambda o: -abs(o["deviations"]))
+
+
+def _outlier(row: Mapping[str, Any], name: str, median: float, deviations: float) -> dict[str, Any]:
+    said = {"name": name, "value": float(row[name]), "median": median, "deviations": deviations}
+    return {"scene": row["scene"], "view": row["view"], **said}

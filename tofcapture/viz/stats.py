@@ -74,7 +74,13 @@ def bit_rows(stats: DatasetStats) -> list[list[str]]:
 def outlier_rows(stats: DatasetStats, most: int = 50) -> list[list[str]]:
     """Rows of view, number, value, median of all, robust standard deviations."""
     return [
-        [f"{o.scene} view {o.view}", o.name, f"{o.value:.4g}", f"{o.median:.4g}", f"{o.deviations:+.1f}"]
+        [
+            f"{o['scene']} view {o['view']}",
+            o["name"],
+            f"{o['value']:.4g}",
+            f"{o['median']:.4g}",
+            f"{o['deviations']:+.1f}",
+        ]
         for o in stats.outliers[:most]
     ]
 

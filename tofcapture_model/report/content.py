@@ -24,7 +24,6 @@ from tofcapture_model.report.scores import POOLS, headline, sample, tables, tile
 from tofcapture_model.report.sources import Network, Sources, doubts
 
 _SAME_DEG, _SAME_MM = 1e-6, 1e-6
-_MOST = 400  # points of a curve
 _SIDES = ((0, "seen from above"), (1, "seen from the side"))
 
 
@@ -181,11 +180,11 @@ def loss_curve(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, tuple[list[
     ]
     if len(points) < 2:
         return {}, ""
-    curve = {}
-    for stage in dict.fromkeys(p[0] for p in points):
-        own = [p for p in points if p[0] == stage]
-        some = [*own[: -1 : max(1, len(own) // _MOST)], own[-1]]
-        curve[f"stage {stage}"] = ([p[1] for p in some], [p[2] for p in some])
+    curve: dict[str, tuple[list[int], list[float]]] = {}
+    for stage, step, loss in points:
+        steps, losses = curve.setdefault(f"stage {stage}", ([], []))
+        steps.append(step)
+        losses.append(loss)
     (_, first, start), (_, last, end) = points[0], points[-1]
     return curve, f"from {start:.3g} at step {first} to {end:.3g} at step {last}"
 
