@@ -27,9 +27,6 @@ def parser() -> argparse.ArgumentParser:
     """Options of the program."""
     out = argparse.ArgumentParser(prog="python -m tests.ur_emulator", description=__doc__)
     out.add_argument("--host", default="127.0.0.1", help="loopback address to listen on (default 127.0.0.1)")
-    out.add_argument(
-        "--port-offset", type=int, default=0, help="added to every port, for clients other than ur_rtde"
-    )
     out.add_argument("--model", default="ur10e", help="ur10e or ur5e")
     out.add_argument("--serial", default="20235500001", help="the arm's serial number, digits")
     out.add_argument(
@@ -38,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
     return out
 
 
-async def run(host: str, offset: int, robot: Robot, *, stay: bool = False) -> None:
+async def run(host: str, robot: Robot, *, stay: bool = False) -> None:
     """Listen on all ports and play the robot until stdin closes (for ever with ``stay``)."""
     rtde = RtdeServer(robot)
     scripts = ScriptPort(robot)
@@ -51,8 +48,8 @@ async def run(host: str, offset: int, robot: Robot, *, stay: bool = False) -> No
         30004: rtde.serve,
     }
     for port, serve in ports.items():
-        await asyncio.start_server(serve, host, port + offset)
-    print(json.dumps({"ready": host, "rtde": 30004 + offset, "control": CONTROL + offset}), flush=True)
+        await asyncio.start_server(serve, host, port)
+    print(json.dumps({"ready": host, "control": CONTROL}), flush=True)
     if not stay:
         asyncio.get_running_loop().add_reader(sys.stdin, _end_with_parent)
     due = time.monotonic()
@@ -77,7 +74,7 @@ def main() -> None:
         raise SystemExit(f"--host: expected a loopback address, got {args.host}: this is no real controller")
     robot = Robot(args.model, Faults(), serial=args.serial)
     try:
-        asyncio.run(run(args.host, args.port_offset, robot, stay=args.stay))
+        asyncio.run(run(args.host, robot, stay=args.stay))
     except KeyboardInterrupt:
         os._exit(130)
 
