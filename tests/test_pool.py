@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -91,16 +92,19 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="asks /proc whether a process lives")
-def test_workers_end_with_whoever_opened_the_pool(tmp_path):
-    """SIGKILL of the process in the middle of a task leaves no worker behind."""
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_whoever_opened_the_pool(tmp_path, end):
+    """Killed or interrupted in the middle of a task, the process leaves no worker behind, and no worker complains."""
     script = tmp_path / "script.py"
     script.write_text(ORPHANS)
-    owner = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    owner = subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     worker = int(owner.stdout.readline())
     assert _alive(worker)
-    owner.kill()
-    owner.wait()
-    owner.stdout.close()
+    owner.send_signal(end)
+    said = owner.communicate(timeout=60)[1]
+    assert "Process Spawn" not in said
     deadline = time.monotonic() + 60
     while _alive(worker) and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -66,17 +66,17 @@ class Pool:
 
     def __enter__(self) -> Self:
         # A worker reads from this pipe until nobody can write to it any more, and then ends.
-        self._ear, self._mouth = self._context.Pipe(duplex=False)
+        self._lifeline, self._held = self._context.Pipe(duplex=False)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._mouth.close()  # what workers still write has other names until it is whole
+        self._held.close()  # what workers still write has other names until it is whole
         if self._executor is not None:
             self._executor.shutdown(wait=True, cancel_futures=True)
         self._executor = None
-        self._ear.close()
+        self._lifeline.close()
 
     def run(
         self,
@@ -154,7 +154,7 @@ class Pool:
         while True:
             if self._executor is None:
                 self._executor = ProcessPoolExecutor(
-                    self._jobs, self._context, _begin, (self._ear, self._pinned)
+                    self._jobs, self._context, _begin, (self._lifeline, self._pinned)
                 )
             try:
                 with _environment():
@@ -179,19 +179,19 @@ def _environment() -> Iterator[None]:
             os.environ.pop(name, None) if value is None else os.environ.update({name: value})
 
 
-def _begin(ear: Connection, pinned: bool) -> None:
+def _begin(lifeline: Connection, pinned: bool) -> None:
     """Prepare a worker, before any library is loaded."""
     signal.signal(
         signal.SIGINT, signal.SIG_IGN
     )  # Ctrl-C reaches whoever opened the pool, who ends the workers
     if pinned and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    threading.Thread(target=_end_with, args=(ear,), daemon=True).start()
+    threading.Thread(target=_end_with_pool, args=(lifeline,), daemon=True).start()
 
 
-def _end_with(ear: Connection) -> None:
+def _end_with_pool(lifeline: Connection) -> None:
     try:
-        ear.recv_bytes()
+        lifeline.recv_bytes()
     except (EOFError, OSError):
         os._exit(1)
 

@@ -37,7 +37,7 @@ _CONNECT = 10.0  # s
 
 @dataclass(frozen=True)
 class BuildResult:
-    """What a build did.
+    """Report what a build did.
 
     Attributes
     ----------

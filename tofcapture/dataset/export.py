@@ -24,7 +24,7 @@ EXPORTERS: Mapping[str, Exporter] = {"ply": export_ply, "png16": export_png, "mc
 
 @dataclass(frozen=True)
 class Exported:
-    """What an export did.
+    """Report what an export did.
 
     Attributes
     ----------

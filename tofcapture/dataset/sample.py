@@ -29,7 +29,7 @@ SPARSE = 4  # pixels between points that vote for the table
 
 @dataclass(frozen=True)
 class SampleConfig:
-    """What a sample depends on besides the view and the rig.
+    """Choose what a sample depends on besides the view and the rig.
 
     Attributes
     ----------

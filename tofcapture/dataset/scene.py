@@ -43,7 +43,7 @@ WORK = ".work-"  # folders beside the shards in which they are made
 
 @dataclass(frozen=True)
 class SceneTask:
-    """What one shard is made of, and where it goes.
+    """Say what one shard is made of, and where it goes.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class SceneTask:
 
 @dataclass(frozen=True)
 class SceneOutcome:
-    """What became of a task.
+    """Report what became of a task.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Which scenes train and which test: by a hash of their objects, so that no object is in two splits."""
+"""Splits scenes by a hash of their objects, so that no object is in two splits."""
 
 from __future__ import annotations
 

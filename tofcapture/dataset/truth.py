@@ -1,4 +1,4 @@
-"""How wrong the ground truth is, where a simulator knows the truth."""
+"""Measures how wrong the ground truth is, where a simulator knows the truth."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ SPLITS = ("train", "val", "test")
 
 
 class MaskBit(IntFlag):
-    """Why a ground-truth pixel should not be trusted; 0 is good ground truth. :data:`MASK_DOCS` says what each means."""
+    """Tell why a ground-truth pixel should not be trusted; 0 is good ground truth. :data:`MASK_DOCS` says what each means."""
 
     NOT_HIT = 1
     OCCLUDED = 2

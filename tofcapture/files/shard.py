@@ -46,7 +46,7 @@ Scale = Literal[1, 2, 4]
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Stereo ground truth on the ToF plane at one scale.
+    """Hold stereo ground truth on the ToF plane at one scale.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class TofMaps:
 
 @dataclass(frozen=True)
 class ExactMaps:
-    """What only a simulator knows, on the ToF plane at 2x: depth (2H, 2W), metres, and normals (2H, 2W, 3)."""
+    """Hold what only a simulator knows, on the ToF plane at 2x: depth (2H, 2W), metres, and normals (2H, 2W, 3)."""
 
     depth: Float32
     normals: Float32
