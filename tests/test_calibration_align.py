@@ -12,7 +12,7 @@ import pytest
 from calibration.align import align
 from calibration.alignment.averages import average_transforms
 from calibration.alignment.methods import alignment_error
-from calibration.alignment.rounds import RangeResidual, Solution, fit_range_residual
+from calibration.alignment.rounds import Solution, fit_range_residual
 from calibration.cli.align import ALIGN
 from calibration.evidence import evidence_of
 from calibration.registration.clouds import (
@@ -39,7 +39,7 @@ from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth, View
 from tofcapture.o3d import load_open3d
 from tofcapture.ops import phase
-from tofcapture.rig import Rig, load_rig
+from tofcapture.rig import SPEED_OF_LIGHT, RangeError, Rig, load_rig
 
 TOF = Camera(240, 180, 190.6186, 200.7526, 116.8406, 101.4767)
 STEREO = Camera(640, 512, 575.0, 575.0, 319.5, 255.5)
@@ -245,7 +245,9 @@ def test_numbers_of_evidence_are_those_of_the_registrations():
     lost = replace(registrations[4], inliers=0, rmse=np.nan, condition=np.inf, fitness=0.0)
     refusals = [None] * 4 + [Refusal.NO_OVERLAP]
     average = average_transforms([r.T_target_source for r in registrations[:4]], at)
-    residual = RangeResidual(TOF, 100e6, np.array([0.004, 1e-5, 0, 0, 0.001, -0.002, 0, 0]))
+    residual = RangeError(
+        100e6, offset=0.004, per_pixel_radius=1e-5, harmonics=((1, 0, 0), (2, 0.001, -0.002), (4, 0, 0))
+    )
     solution = Solution([*registrations[:4], lost], refusals, average, [0, 1, 2, 3], at, residual)
     rig = Rig(TOF, STEREO, np.eye(4), np.eye(4))
     none = Cloud(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -374,19 +376,20 @@ def test_grid_normals_of_a_plane_are_exact_and_face_the_camera():
 def test_range_residual_recovers_a_wave():
     """A wave put on the ranges of six tilted planes is found to a tenth of a millimetre with their poses unknown."""
     rng = np.random.default_rng(0)
-    truth = RangeResidual(TOF, 100e6, np.array([0, 0, 0, 0, 0.001, -0.002, 0, 0]))
+    truth = RangeError(100e6, harmonics=((2, 0.001, -0.002),))
     pairs, registrations = [], []
     for _ in range(6):
         normal = np.append(rng.uniform(-0.5, 0.5, 2), 1.0)
         exact = (TOF.rays * (rng.uniform(0.6, 1.0) / (TOF.rays @ normal))[..., None])[::2, ::2].reshape(-1, 3)
         unit = -normal / np.linalg.norm(normal)
         target = Cloud(exact, np.tile(unit, (len(exact), 1)))
-        longer = truth.terms(exact) @ truth.coefficients / np.linalg.norm(exact, axis=1)
-        source = exact + exact * longer[:, None]
+        range_ = np.linalg.norm(exact, axis=1)
+        error = truth.at(4 * np.pi * 100e6 / SPEED_OF_LIGHT * range_, 0.0, 45.0)
+        source = exact * (1 + error / range_)[:, None]
         pairs.append(Pair("", "", source, target, Rig(TOF, STEREO, np.eye(4), np.eye(4)), 100e6, None))
         registrations.append(measure_registration(np.eye(4), source, target))
-    found = fit_range_residual(pairs, registrations, RangeResidual(TOF, 100e6))
-    np.testing.assert_allclose(found.coefficients[4:6], truth.coefficients[4:6], atol=2e-4)
+    found = fit_range_residual(pairs, registrations, RangeError(100e6))
+    np.testing.assert_allclose(found.harmonics[1], truth.harmonics[0], atol=2e-4)
 
 
 def test_align_command_reports_as_text_and_json(recording, monkeypatch):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from tofcapture.camera import Camera
 from tofcapture.errors import QualityError, TofError
 from tofcapture.pool import Pool
 from tofcapture.poses import Float64, invert, transform_points
+from tofcapture.rig import SPEED_OF_LIGHT, RangeError
 
 MIN_PAIRS = 3  # below this no pair can be told from an outlier
 REFINEMENTS = 2  # rounds of range residual and registration after the first; a third changes 0.1 mm
@@ -48,27 +49,18 @@ class RefusedPairsError(QualityError):
         self.refusals = list(refusals)
 
 
-@dataclass(frozen=True)
-class RangeResidual:
-    """The range error that is left in a ToF camera."""
+def free_of(error: RangeError, points: Float64, camera: Camera) -> Float64:
+    """Move points (N, 3) of the ToF frame along their rays to where they would be without a range error."""
+    radial, radius = _range_and_radius(points, camera)
+    phase = 4 * np.pi * error.modulation_hz / SPEED_OF_LIGHT * radial
+    out: Float64 = points * (1 - error.at(phase, radius, error.reference_celsius) / radial)[:, None]
+    return out
 
-    camera: Camera  #: Intrinsics of the ToF camera
-    modulation_hz: float  #: The frequency whose wave number the orders are multiples of
-    #: (T,) float64 of :data:`calibration.range_error.error.SIMPLE`: offset in metres, metres per pixel
-    #: of radius, cosine and sine amplitude of each order in metres
-    coefficients: Float64 = field(default_factory=lambda: np.zeros(len(SIMPLE)))
 
-    def correct(self, points: Float64) -> Float64:
-        """Move points (N, 3) of the ToF frame along their rays to where they would be without the error."""
-        error = self.terms(points) @ self.coefficients
-        out: Float64 = points * (1 - error / np.linalg.norm(points, axis=-1))[:, None]
-        return out
-
-    def terms(self, points: Float64) -> Float64:
-        """Compute what each coefficient multiplies, (N, T), at points (N, 3) of the ToF frame."""
-        focal = [self.camera.fx, self.camera.fy]
-        radius = np.linalg.norm(points[:, :2] / points[:, 2:] * focal, axis=-1)
-        return Terms(self.modulation_hz).columns(np.linalg.norm(points, axis=-1), radius)
+def _range_and_radius(points: Float64, camera: Camera) -> tuple[Float64, Float64]:
+    """Ranges (N,) of points (N, 3), metres, and their pixels' distances (N,) to the principal point."""
+    radius = np.linalg.norm(points[:, :2] / points[:, 2:] * [camera.fx, camera.fy], axis=-1)
+    return np.linalg.norm(points, axis=-1), radius
 
 
 @dataclass(frozen=True)
@@ -81,7 +73,7 @@ class Solution:
     average: Average  #: Of the pairs that passed, ``T_stereo_tof``
     passed: list[int]  #: Indices of the pairs that passed the gate, in the order of ``average``
     working_point: Float64  #: (3,) ToF frame, metres: mean of the centroids of the matched points
-    residual: RangeResidual  #: Range error that was taken off the ToF points of this round
+    residual: RangeError  #: Range error that was taken off the ToF points of this round
 
     @property
     def used(self) -> list[int]:
@@ -101,11 +93,11 @@ def solve(
     :class:`RefusedPairsError` where fewer than three pairs pass the gate or survive as inliers.
     """
     guess = T = invert(T_tof_stereo)
-    residual = RangeResidual(pairs[0].rig.tof, pairs[0].modulation_hz)
+    residual, camera = RangeError(pairs[0].modulation_hz), pairs[0].rig.tof
     distances: Sequence[float] = COARSE_TO_FINE
     with Pool(1, pinned=True) as pool:
         for n in range(1 + REFINEMENTS):
-            corrected = [replace(p, source=residual.correct(p.source)) for p in pairs]
+            corrected = [replace(p, source=free_of(residual, p.source, camera)) for p in pairs]
             found = _registered(pool, backend, corrected, T, distances, progress, n * len(pairs))
             gated = zip(found, corrected, strict=True)
             refusals = [check_registration(r, p.source, p.target, guess) for r, p in gated]
@@ -138,9 +130,7 @@ def _registered(
     return [found[i] for i in range(len(pairs))]
 
 
-def _averaged(
-    results: list[Registration], refusals: list[Refusal | None], residual: RangeResidual
-) -> Solution:
+def _averaged(results: list[Registration], refusals: list[Refusal | None], residual: RangeError) -> Solution:
     passed = [i for i, refusal in enumerate(refusals) if refusal is None]
     demand_pairs(len(passed), refusals)
     chosen = [results[i] for i in passed]
@@ -164,8 +154,8 @@ def demand_pairs(good: int, refusals: Sequence[Refusal | None]) -> None:
 
 
 def fit_range_residual(
-    pairs: Sequence[Pair], registrations: Sequence[Registration], start: RangeResidual
-) -> RangeResidual:
+    pairs: Sequence[Pair], registrations: Sequence[Registration], start: RangeError
+) -> RangeError:
     """Estimate the range error from pairs, already corrected by ``start``, and their registrations.
 
     One linear least-squares problem in the shared coefficients and in a small motion of every pair, without which a pair's
@@ -173,17 +163,20 @@ def fit_range_residual(
     determine at zero.
     """
     H = np.diag((NOISE / PRIOR) ** 2)
-    g = -H @ start.coefficients
+    waves = [x for _, *amplitudes in start.harmonics for x in amplitudes] or [0.0] * (len(SIMPLE) - 2)
+    g = -H @ np.array([start.offset, start.per_pixel_radius, *waves])
+    terms = Terms(start.modulation_hz)
     for pair, result in zip(pairs, registrations, strict=True):
         source = pair.source[::STRIDE]
         found = residuals(source, pair.target, result.T_target_source)
         points = source[found.source]
         rays = points / np.linalg.norm(points, axis=-1)[:, None] @ result.T_target_source[:3, :3].T
-        waves = start.terms(points) * (found.normals * rays).sum(axis=-1)[:, None]
+        columns = terms.columns(*_range_and_radius(points, pair.rig.tof))
+        error = columns * (found.normals * rays).sum(axis=-1)[:, None]
         J, weights = found.jacobian(result.centre), tukey_weights(found.distance)[:, None]
         # Schur complement: what the pair's own motion explains is taken out.
         motion = np.linalg.pinv((J * weights).T @ J)
-        cross = (waves * weights).T @ J
-        H += (waves * weights).T @ waves - cross @ motion @ cross.T
-        g += (waves * weights).T @ found.distance - cross @ motion @ ((J * weights).T @ found.distance)
-    return replace(start, coefficients=start.coefficients + np.linalg.solve(H, g))
+        cross = (error * weights).T @ J
+        H += (error * weights).T @ error - cross @ motion @ cross.T
+        g += (error * weights).T @ found.distance - cross @ motion @ ((J * weights).T @ found.distance)
+    return terms.added(start, np.linalg.solve(H, g))

@@ -15,12 +15,11 @@ import numpy as np
 from calibration.alignment.methods import alignment_error
 from calibration.alignment.rounds import Solution
 from calibration.limits import Judged, judged, worst
-from calibration.range_error.error import Terms
 from calibration.registration.pairs import Pair
 from tofcapture.errors import DataError
 from tofcapture.files.seal import write_text
 from tofcapture.poses import Float64, invert, rotation_angle, transform_points
-from tofcapture.rig import RangeError, range_error_table
+from tofcapture.rig import range_error_table
 
 FORMAT = "tofcapture-evidence"
 ASIDE = 0.1  # m from the working point at which the least certain motion is stated
@@ -40,8 +39,7 @@ def evidence_of(
     (4, 4) are the start and the result. What the method has ``found`` of itself, as its standard error, replaces the average's.
     """
     rows = [_pair(i, pair, solution) for i, pair in enumerate(pairs)]
-    true, residual = pairs[0].truth, solution.residual
-    hz = residual.modulation_hz
+    true = pairs[0].truth
     evidence = {
         "format": FORMAT,
         "version": 1,
@@ -53,7 +51,7 @@ def evidence_of(
         "spread": _degrees_mm(*solution.average.spread),
         "standard_error": _degrees_mm(*solution.average.standard_error),
         "working_point_m": solution.working_point.tolist(),
-        "range_residual": range_error_table(Terms(hz).added(RangeError(hz), residual.coefficients)),
+        "range_residual": range_error_table(solution.residual),
         "pairs": rows,
         "truth": None if true is None else _degrees_mm(*alignment_error(T_tof_stereo, true), "_error"),
         "provenance": {

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from calibration.alignment.rounds import RangeResidual
+from calibration.alignment.rounds import free_of
 from calibration.board.coverage import coverage
 from calibration.evidence import covariance_of, read_evidence
 from calibration.evidence.compare import Drift, OldRig, drift
 from calibration.limits import LIMITS, Judged, judged, worst
-from calibration.range_error.error import SIMPLE
 from calibration.registration.clouds import stereo_cloud, surface_points, tof_depth
 from calibration.registration.gate import residuals
 from calibration.registration.pairs import calibration_views
@@ -23,6 +22,7 @@ from tofcapture.camera import Camera
 from tofcapture.colours import Scale
 from tofcapture.frames import View
 from tofcapture.poses import Float64, check_transform, invert, transform
+from tofcapture.rig import SPEED_OF_LIGHT, range_error_from
 from tofcapture.viz import charts
 from tofcapture.viz.page import write_page
 
@@ -217,8 +217,9 @@ def _wave(evidence: Mapping[str, Any], samples: Samples) -> tuple[Float64, Float
         return None
     near, far = np.quantile(samples.range, (0.01, 0.99))
     r = np.linspace(float(near), float(far), 200)
-    model = residual_from(evidence, samples.camera)
-    return r, 1e3 * (model.terms(np.column_stack([0 * r, 0 * r, r])) @ model.coefficients)
+    error = range_error_from(evidence["range_residual"])
+    phase = 4 * np.pi * error.modulation_hz / SPEED_OF_LIGHT * r
+    return r, 1e3 * error.at(phase, 0.0, error.reference_celsius)
 
 
 def _residual_charts(samples: Samples, wave: tuple[Float64, Float64] | None) -> list[tuple[str, str]]:
@@ -336,24 +337,13 @@ def sample_recording(recording: Path, evidence: Mapping[str, Any], progress: Pro
 _ARRAYS = ("pixel", "range", "amplitude", "residual", "rims")
 
 
-def residual_from(evidence: Mapping[str, Any], camera: Camera) -> RangeResidual:
-    """Read the range residual that an evidence states; none where it states none."""
-    table = evidence.get("range_residual")
-    if table is None:
-        return RangeResidual(camera, 100e6)
-    found = {"offset": table["offset"], "radius": table["per_pixel_radius"]}
-    for m, a, b in table["harmonics"]:
-        found |= {f"cos {m}": a, f"sin {m}": b}
-    coefficients = np.array([found.get(name, 0.0) for name in SIMPLE])
-    return RangeResidual(camera, float(table["modulation_hz"]), coefficients)
-
-
 def _sample(view: View, T_stereo_tof: Float64, evidence: Mapping[str, Any]) -> Samples:
     camera = view.tof.info.camera
     phasor, depth = tof_depth(view.tof)
     raw = surface_points(view.tof, depth)
     raw = raw[:: max(1, len(raw) // MOST_POINTS)]
-    points = residual_from(evidence, camera).correct(raw)
+    stated = evidence.get("range_residual")
+    points = free_of(range_error_from(stated), raw, camera) if stated else raw
     found = residuals(points, stereo_cloud(view.stereo), T_stereo_tof)
     kept = raw[found.source]
     pixel, _ = camera.project(kept)
