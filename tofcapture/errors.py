@@ -20,22 +20,13 @@ from __future__ import annotations
 
 
 class TofError(Exception):
-    """Base of the tree.
-
-    Parameters
-    ----------
-    message
-        Expected, got, where; one sentence.
-    hint
-        What to try next; one sentence, may be empty.
-    """
+    """Base of the tree: a message (expected, got, where) and a hint (what to try next), one sentence each."""
 
     exit_code = 1
 
     def __init__(self, message: str, hint: str = "") -> None:
         super().__init__(message)
-        self.message = message
-        self.hint = hint
+        self.message, self.hint = message, hint
 
 
 class UsageError(TofError):

@@ -19,25 +19,13 @@ def _preload_libusb() -> None:
     try:
         ctypes.CDLL("libusb-1.0.so.0", mode=ctypes.RTLD_GLOBAL)
     except OSError:
-        libusb_package = importlib.import_module("libusb_package")
-        path = libusb_package.get_library_path()
+        path = importlib.import_module("libusb_package").get_library_path()
         if path is not None:
             ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
 
 
 def load_open3d() -> ModuleType:
-    """Import open3d wherever it can be imported.
-
-    Returns
-    -------
-    module
-        The ``open3d`` module.
-
-    Raises
-    ------
-    ConfigError
-        When open3d is not installed or does not load.
-    """
+    """Import open3d; :class:`ConfigError` when it is not installed or does not load."""
     if "open3d" not in sys.modules and sys.platform == "linux":
         # Where this fails, open3d's own error names the library that is missing.
         with contextlib.suppress(ImportError, OSError):

@@ -21,11 +21,8 @@ def _configure_view(parser: argparse.ArgumentParser) -> None:
     add(
         "--out", type=Path, required=True, metavar="VIEW.h5", help="view file to write; replaced if it exists"
     )
-    add(
-        "--ideal",
-        action="store_true",
-        help="no sensor imperfection, no quantisation; geometry, albedo and multipath stay",
-    )
+    text = "no sensor imperfection, no quantisation; geometry, albedo and multipath stay"
+    add("--ideal", action="store_true", help=text)
     add("--frames", type=int, default=None, help="frames in the burst (default 10, ideal 1)")
 
 
@@ -55,7 +52,6 @@ def _run_view(args: argparse.Namespace) -> Outcome:
 
 def _configure_dataset(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--scenes", type=int, required=True, metavar="N", help="scenes to simulate")
     add(
         "--out",
         type=Path,
@@ -63,34 +59,23 @@ def _configure_dataset(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="the dataset's folder; completed when it exists",
     )
-    add(
-        "--suite",
-        default="tof100",
-        metavar="NAME",
-        help="tof100, indoor, multipath or noise (default tof100; docs/simulator.md)",
-    )
-    add("--seed", type=int, default=0, help="seed of everything (default 0)")
-    add("--views", type=int, default=25, help="views of each scene (default 25)")
-    add("--frames", type=int, default=10, help="ToF frames of each view (default 10)")
-    add(
-        "--cameras", type=int, default=1, metavar="N", help="rigs that the scenes take turns with (default 1)"
-    )
-    add(
-        "--kinds",
-        nargs="+",
-        default=(),
-        metavar="KIND",
-        help="kinds of scenes, in turns, instead of the recipe's (tof100): object, combination, concave, corner, bright, dark, mesh",
-    )
+    add("--suite", default="tof100", metavar="NAME", help="tof100 (default), indoor, multipath or noise")
+    for name, default, text in (
+        ("--scenes", None, "scenes to simulate"),
+        ("--seed", 0, "seed of everything (default 0)"),
+        ("--views", 25, "views of each scene (default 25)"),
+        ("--frames", 10, "ToF frames of each view (default 10)"),
+        ("--cameras", 1, "rigs that the scenes take turns with (default 1)"),
+        ("--jobs", None, "processes (default one per core)"),
+    ):
+        add(name, type=int, metavar="N", default=default, required=name == "--scenes", help=text)
+    kinds = "object, combination, concave, corner, bright, dark, mesh"
+    text = f"kinds of scenes, in turns, instead of the recipe's (tof100): {kinds}"
+    add("--kinds", nargs="+", default=(), metavar="KIND", help=text)
     add("--meshes", type=Path, metavar="DIR", help="meshes for a tenth of the scenes (tof100)")
     add("--mesh-unit", default="mm", help="unit of the meshes: m, cm or mm (default mm)")
     add("--station", type=Path, metavar="TOML", help="take the simulator's constants from its [sim]")
-    add(
-        "--split",
-        choices=("train", "val", "test"),
-        help="put every scene into this split (default: by their objects)",
-    )
-    add("--jobs", type=int, metavar="J", help="processes (default one per core)")
+    add("--split", choices=("train", "val", "test"), help="of every scene (default: by their objects)")
 
 
 def _run_dataset(args: argparse.Namespace) -> Outcome:
@@ -108,18 +93,11 @@ def _run_dataset(args: argparse.Namespace) -> Outcome:
         raise UsageError(f"--meshes: the suite {args.suite} takes no meshes", hint="--suite tof100")
     meshes = () if args.meshes is None else table_meshes(args.meshes, args.mesh_unit, args.seed)
     tables = {} if args.station is None else read_station(args.station).get("sim", {})
-    spec = DatasetSpec(
-        suite=args.suite,
-        seed=args.seed,
-        scenes=args.scenes,
-        views=args.views,
-        frames=args.frames,
-        meshes=meshes,
-        mesh_unit=args.mesh_unit,
-        cameras=args.cameras,
-        kinds=tuple(args.kinds),
-        sim={name: table for name, table in tables.items() if isinstance(table, dict)},
-    )
+    same = {
+        k: getattr(args, k) for k in ("suite", "seed", "scenes", "views", "frames", "mesh_unit", "cameras")
+    }
+    sim = {name: table for name, table in tables.items() if isinstance(table, dict)}
+    spec = DatasetSpec(**same, meshes=meshes, kinds=tuple(args.kinds), sim=sim)
     with progress() as report:
         result = simulate_dataset(
             spec, args.out, args.jobs, lambda done, total: report("views", done, total), args.split
