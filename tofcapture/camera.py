@@ -53,10 +53,8 @@ def distortion_jacobian(xy: Float64, coefficients: NDArray[np.floating] | Sequen
 def undistorted(goal: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> Float64:
     """Invert :func:`distorted` by Newton's method, to 1e-9; NaN stays NaN.
 
-    Raises
-    ------
-    ConfigError
-        When the lens folds before it reaches a coordinate: it was fitted on a smaller part of the image.
+    Raises :class:`ConfigError` when the lens folds before it reaches a coordinate: it was fitted on a smaller part of
+    the image.
     """
     xy = np.array(goal, dtype=np.float64)
     for _ in range(_NEWTON_STEPS):
@@ -138,10 +136,7 @@ class Camera:
     def pinhole(self, where: str) -> Camera:
         """Return the camera itself; what assumes straight projection asks for it.
 
-        Raises
-        ------
-        ConfigError
-            When the camera has distortion.
+        Raises :class:`ConfigError` when the camera has distortion.
         """
         if self.distortion:
             raise ConfigError(

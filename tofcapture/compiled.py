@@ -40,10 +40,7 @@ class _Kernel:
 def compiled(function: F) -> F:
     """Compile a function of arrays and numbers to machine code at its first call.
 
-    Raises
-    ------
-    ConfigError
-        At that call, when numba is not installed or does not load.
+    Raises :class:`ConfigError`: at that call, when numba is not installed or does not load.
     """
     return cast("F", _Kernel(function))
 

@@ -20,10 +20,7 @@ _SMALL = 1e-6  # rad; below this the Taylor series of the rotation formulas is e
 def check_transform(T: ArrayLike, name: str = "transform") -> Float64:
     """Coerce to a rigid (4, 4) float64 transform, or say what is wrong with it; ``name`` is what to call it then.
 
-    Raises
-    ------
-    ConfigError
-        Wrong shape, not finite, not orthonormal to 1e-6, left-handed, or last row not 0 0 0 1.
+    Raises :class:`ConfigError`: wrong shape, not finite, not orthonormal to 1e-6, left-handed, or last row not 0 0 0 1.
     """
     out = np.asarray(T, dtype=np.float64)
     if out.shape != (4, 4):
@@ -139,6 +136,8 @@ def log(T: Float64) -> Float64:
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), roll: float = 0.0) -> Float64:
     """Pose a camera (x right, y down, z forward) so that it looks at a point.
 
+    Raises :class:`ConfigError` when eye and target coincide.
+
     Parameters
     ----------
     eye, target
@@ -151,11 +150,6 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), 
     Returns
     -------
     T_world_camera, (4, 4) float64
-
-    Raises
-    ------
-    ConfigError
-        When eye and target coincide.
     """
     eye = np.asarray(eye, dtype=np.float64)
     z = np.asarray(target, dtype=np.float64) - eye

@@ -49,6 +49,8 @@ class RangeError:
     ) -> Float64:
         """Compute the error, metres.
 
+        Raises :class:`ConfigError` when a term lacks what it depends on.
+
         Parameters
         ----------
         phase
@@ -57,11 +59,6 @@ class RangeError:
             Distance to the principal point, broadcastable to ``phase``; sensor temperature.
         place, amplitude
             (..., 2) of :func:`image_places`, and raw units; needed where there are ``image`` terms, or ``per_inverse_amplitude``.
-
-        Raises
-        ------
-        ConfigError
-            When a term lacks what it depends on.
         """
         phase = np.asarray(phase, dtype=np.float64)
         r = phase * SPEED_OF_LIGHT / (4 * np.pi * self.modulation_hz)
@@ -196,10 +193,7 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
 def rig_from_dict(table: Mapping[str, Any], where: str = "rig") -> Rig:
     """Read a rig from plain TOML types.
 
-    Raises
-    ------
-    ConfigError
-        Unknown or missing keys, units other than metres, transforms that are not rigid.
+    Raises :class:`ConfigError`: unknown or missing keys, units other than metres, transforms that are not rigid.
     """
     known = {"format", "version", "units", "tof", "stereo", "T_tof_stereo", "T_flange_tof", "range_error"}
     unknown = table.keys() - known
@@ -241,10 +235,7 @@ def loads_rig(text: str, where: str = "rig") -> Rig:
 def load_rig(path: Path) -> Rig:
     """Read ``rig.toml``.
 
-    Raises
-    ------
-    ConfigError
-        Missing, not TOML, or not a rig.
+    Raises :class:`ConfigError`: missing, not TOML, or not a rig.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")

@@ -28,6 +28,8 @@ SPIKE_PIXELS = 2.0  # and at least this many pixel footprints, so that creases s
 def denoise(depth: NDArray[np.floating], camera: Camera) -> Bool:
     """Say which points of a stereo depth image to keep.
 
+    Raises :class:`DataError` when depth is not of the camera's shape.
+
     Parameters
     ----------
     depth
@@ -38,11 +40,6 @@ def denoise(depth: NDArray[np.floating], camera: Camera) -> Bool:
     Returns
     -------
     (SH, SW) bool; False where depth is NaN.
-
-    Raises
-    ------
-    DataError
-        When depth is not of the camera's shape.
     """
     if depth.shape != camera.shape:
         raise DataError(f"denoise: expected depth of shape {camera.shape}, got {depth.shape}")

@@ -33,6 +33,8 @@ def normals_from_depth(depth: NDArray[np.floating], camera: Camera, radius: int 
 
     Exact for planes at any tilt. A window that straddles a depth edge mixes both sides.
 
+    Raises :class:`DataError` when depth is not of the camera's shape.
+
     Parameters
     ----------
     depth
@@ -45,11 +47,6 @@ def normals_from_depth(depth: NDArray[np.floating], camera: Camera, radius: int 
     Returns
     -------
     (H, W, 3) float64, unit, camera frame, facing the camera; NaN where depth is NaN or its window determines no plane.
-
-    Raises
-    ------
-    DataError
-        When depth is not of the camera's shape.
     """
     _expect(depth, camera)
     valid = np.isfinite(depth) & (depth > 0)

@@ -124,10 +124,7 @@ def paths(out: Path, scene: str) -> tuple[Path, Path, Path]:
 def finished(spec: DatasetSpec, out: Path, index: int, scene: str) -> Made | None:
     """Read the note of a scene whose shard is in place, and whole; ``None`` when there is none.
 
-    Raises
-    ------
-    ConfigError
-        The scene is there, but of another spec.
+    Raises :class:`ConfigError`: the scene is there, but of another spec.
     """
     _, note, shard = paths(out, scene)
     try:

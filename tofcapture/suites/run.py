@@ -45,6 +45,8 @@ def simulate_dataset(
 ) -> Simulated:
     """Simulate and build a dataset in the folder ``out``, or complete one.
 
+    Raises :class:`ConfigError`: nothing is wanted, the folder holds something else, or the disk is too small.
+
     Parameters
     ----------
     spec, out, progress
@@ -53,11 +55,6 @@ def simulate_dataset(
         Processes; by default one per core. ``1`` works in this process.
     split
         Of all scenes, for a dataset that is only trained on or only evaluated on; ``None``: by their objects.
-
-    Raises
-    ------
-    ConfigError
-        Nothing is wanted, the folder holds something else, or the disk is too small.
     """
     start = time.monotonic()
     _check(spec, out)

@@ -143,10 +143,7 @@ def _sheets(most: int, materials: Mapping[str, Any], rng: np.random.Generator) -
 def table_meshes(folder: Path, mesh_unit: str, seed: int) -> tuple[Path, ...]:
     """List the meshes of a folder that fit on the table and under the arm, in a seeded order.
 
-    Raises
-    ------
-    ConfigError
-        No folder, or no mesh of a fitting size in it.
+    Raises :class:`ConfigError`: no folder, or no mesh of a fitting size in it.
     """
     if not folder.is_dir():
         raise ConfigError(f"--meshes {folder}: expected a folder of PLY, OBJ or STL files")

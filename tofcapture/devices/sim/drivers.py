@@ -116,10 +116,7 @@ class SimArm(_InWorld, Arm):
     def move_to(self, joints: Float64) -> ArmState:
         """Move along the joints at the model's speed, settle, and report; takes no time of ours.
 
-        Raises
-        ------
-        MotionRefused
-            The goal is not six finite angles within the limits.
+        Raises :class:`MotionRefused`: the goal is not six finite angles within the limits.
         """
         goal = check_joints(self._model, joints)
         self._world.faults.before_move()

@@ -93,10 +93,7 @@ class Faults:
     def before_points(self) -> bool:
         """Move the arm before the stereo camera captures, as planned; tells whether the point map is to be empty.
 
-        Raises
-        ------
-        DeviceError
-            As planned.
+        Raises :class:`DeviceError`: as planned.
         """
         burst = self._bursts - 1
         self._wait(burst)

@@ -52,6 +52,9 @@ class Signals:
 class Decoder:
     """Decodes raw frames of one camera; its buffers serve one thread.
 
+    Raises :class:`DataError` when there are not exactly two frequencies in a whole ratio, or phases that determine no
+    phasor.
+
     Parameters
     ----------
     info
@@ -59,11 +62,6 @@ class Decoder:
     noise, min_amplitude
         Of one tap: decides which pixels are of low confidence. Those whose weaker amplitude is not above the least, raw units,
         have no depth.
-
-    Raises
-    ------
-    DataError
-        When there are not exactly two frequencies in a whole ratio, or phases that determine no phasor.
     """
 
     def __init__(self, info: TofInfo, noise: TapNoise | None = None, min_amplitude: float = 0.0) -> None:

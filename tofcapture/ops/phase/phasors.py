@@ -49,17 +49,15 @@ def solution(
 def phasors(raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequence[float]) -> Complex128:
     """Fit the phasor of each frequency by least squares: (..., F, H, W), ``A exp(i phi)``, frequencies ascending.
 
+    Raises :class:`DataError` when channels and descriptions disagree, or the phases of a frequency do not determine a
+    phasor.
+
     Parameters
     ----------
     raw
         (..., K, H, W) taps, any real dtype, in any order of channels.
     modulation_hz, phase_rad
         (K,) frequency and demodulation phase of each channel.
-
-    Raises
-    ------
-    DataError
-        When channels and descriptions disagree, or the phases of a frequency do not determine a phasor.
     """
     if raw.shape[-3] != len(modulation_hz) or len(modulation_hz) != len(phase_rad):
         raise DataError(
