@@ -9,7 +9,7 @@ Camera frames have x right, y down, z forward. Pixel centres are integers, so th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -123,15 +123,8 @@ class Camera:
 
     def scaled(self, s: int) -> Camera:
         """Scale the same view to ``s`` times the resolution: ``f' = s f``, ``c' = s (c + 0.5) - 0.5``."""
-        return replace(
-            self,
-            width=self.width * s,
-            height=self.height * s,
-            fx=self.fx * s,
-            fy=self.fy * s,
-            cx=s * (self.cx + 0.5) - 0.5,
-            cy=s * (self.cy + 0.5) - 0.5,
-        )
+        cx, cy = s * (self.cx + 0.5) - 0.5, s * (self.cy + 0.5) - 0.5
+        return Camera(self.width * s, self.height * s, self.fx * s, self.fy * s, cx, cy, self.distortion)
 
     def pinhole(self, where: str) -> Camera:
         """Return the camera itself; what assumes straight projection asks for it.
@@ -189,12 +182,8 @@ class Camera:
     def project(self, points: NDArray[np.floating]) -> tuple[Float64, Float64]:
         """Project points (..., 3), camera frame, metres.
 
-        Returns
-        -------
-        pixels
-            (..., 2) as (u, v); NaN at or behind the camera plane, and beyond the angle at which a distorted image folds.
-        depth
-            (...,), metres.
+        Returns pixels (..., 2) as (u, v), NaN at or behind the camera plane and beyond the angle at which a distorted image
+        folds, and depth (...,), metres.
         """
         z: Float64 = np.asarray(points, dtype=np.float64)[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):

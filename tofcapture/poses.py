@@ -134,7 +134,7 @@ def log(T: Float64) -> Float64:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), roll: float = 0.0) -> Float64:
-    """Pose a camera (x right, y down, z forward) so that it looks at a point.
+    """Pose a camera (x right, y down, z forward) so that it looks at a point: ``T_world_camera`` (4, 4).
 
     Raises :class:`ConfigError` when eye and target coincide.
 
@@ -146,10 +146,6 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), 
         World direction that should appear upwards; replaced by world x when the view is parallel to it.
     roll
         Rotation about the optical axis, radians.
-
-    Returns
-    -------
-    T_world_camera, (4, 4) float64
     """
     eye = np.asarray(eye, dtype=np.float64)
     z = np.asarray(target, dtype=np.float64) - eye

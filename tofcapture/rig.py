@@ -40,13 +40,9 @@ class RangeError:
     per_inverse_amplitude: float = 0.0  #: Metres times raw units: what dark surfaces are measured too far.
 
     def at(
-        self,
-        phase: NDArray[np.floating],
-        radius_px: NDArray[np.floating] | float,
-        celsius: float,
-        place: NDArray[np.floating] | None = None,
-        amplitude: NDArray[np.floating] | None = None,
-    ) -> Float64:
+        self, phase: NDArray[np.floating], radius_px: NDArray[np.floating] | float, celsius: float,
+        place: NDArray[np.floating] | None = None, amplitude: NDArray[np.floating] | None = None,
+    ) -> Float64:  # fmt: skip
         """Compute the error, metres.
 
         Raises :class:`ConfigError` when a term lacks what it depends on.
@@ -79,9 +75,7 @@ class RangeError:
         if not self.image:
             return 0.0
         if place is None:
-            raise ConfigError(
-                "range error: terms over the image need the pixel's place", hint="see image_places"
-            )
+            raise ConfigError("range error: terms over the image need the pixel's place", "see image_places")
         x, y = place[..., 0], place[..., 1]
         return np.asarray(sum(c * x**i * y**j for i, j, c in self.image), dtype=np.float64)
 
@@ -190,22 +184,23 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
     }
 
 
-def rig_from_dict(table: Mapping[str, Any], where: str = "rig") -> Rig:
-    """Read a rig from plain TOML types.
+def loads_rig(text: str, where: str = "rig") -> Rig:
+    """Read the text of a ``rig.toml``.
 
-    Raises :class:`ConfigError`: unknown or missing keys, units other than metres, transforms that are not rigid.
+    Raises :class:`ConfigError`: not TOML, unknown or missing keys, units other than metres, transforms that are not rigid.
     """
-    known = {"format", "version", "units", "tof", "stereo", "T_tof_stereo", "T_flange_tof", "range_error"}
-    unknown = table.keys() - known
-    if unknown:
-        raise ConfigError(
-            f"{where}: unknown key {', '.join(sorted(unknown))}", hint="see docs/formats.md, rig.toml"
-        )
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as err:
+        raise ConfigError(f"{where}: not TOML: {err}") from err
+    needed = {"tof", "stereo", "T_tof_stereo", "T_flange_tof"}
+    if unknown := table.keys() - needed - {"format", "version", "units", "range_error"}:
+        hint = "see docs/formats.md, rig.toml"
+        raise ConfigError(f"{where}: unknown key {', '.join(sorted(unknown))}", hint)
     if table.get("units") != "m":
         raise ConfigError(f'{where}: expected units = "m", got {table.get("units")!r}')
-    for key in ("tof", "stereo", "T_tof_stereo", "T_flange_tof"):
-        if key not in table:
-            raise ConfigError(f"{where}: missing {key}")
+    if missing := needed - table.keys():
+        raise ConfigError(f"{where}: missing {', '.join(sorted(missing))}")
     errors: Sequence[Mapping[str, Any]] = table.get("range_error", [])
     return Rig(
         tof=camera_from(table["tof"], f"{where}: [tof]"),
@@ -224,14 +219,6 @@ def dumps_rig(rig: Rig) -> str:
     return str(tomli_w.dumps(rig_to_dict(rig)))
 
 
-def loads_rig(text: str, where: str = "rig") -> Rig:
-    """Read the text of a ``rig.toml``."""
-    try:
-        return rig_from_dict(tomllib.loads(text), where)
-    except tomllib.TOMLDecodeError as err:
-        raise ConfigError(f"{where}: not TOML: {err}") from err
-
-
 def load_rig(path: Path) -> Rig:
     """Read ``rig.toml``.
 
@@ -240,7 +227,6 @@ def load_rig(path: Path) -> Rig:
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as err:
-        raise ConfigError(
-            f"{path}: cannot read the rig: {err}", hint="tofcapture align RECORDING writes one"
-        ) from err
+        hint = "tofcapture align RECORDING writes one"
+        raise ConfigError(f"{path}: cannot read the rig: {err}", hint) from err
     return loads_rig(text, str(path))

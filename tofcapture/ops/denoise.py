@@ -26,20 +26,9 @@ SPIKE_PIXELS = 2.0  # and at least this many pixel footprints, so that creases s
 
 
 def denoise(depth: NDArray[np.floating], camera: Camera) -> Bool:
-    """Say which points of a stereo depth image to keep.
+    """Say which points of a stereo depth image (SH, SW), z in metres, to keep: none where it is NaN.
 
-    Raises :class:`DataError` when depth is not of the camera's shape.
-
-    Parameters
-    ----------
-    depth
-        (SH, SW) z in the stereo frame, metres; NaN: not measured.
-    camera
-        Intrinsics of the stereo grid.
-
-    Returns
-    -------
-    (SH, SW) bool; False where depth is NaN.
+    Raises :class:`DataError` when depth is not of the shape of the ``camera``, whose intrinsics are the stereo grid's.
     """
     if depth.shape != camera.shape:
         raise DataError(f"denoise: expected depth of shape {camera.shape}, got {depth.shape}")

@@ -35,18 +35,8 @@ def normals_from_depth(depth: NDArray[np.floating], camera: Camera, radius: int 
 
     Raises :class:`DataError` when depth is not of the camera's shape.
 
-    Parameters
-    ----------
-    depth
-        (H, W) z in metres; NaN: none.
-    camera
-        Intrinsics of the image.
-    radius
-        The window is ``2 radius + 1`` pixels wide; 4 gives the paper's 9 x 9.
-
-    Returns
-    -------
-    (H, W, 3) float64, unit, camera frame, facing the camera; NaN where depth is NaN or its window determines no plane.
+    ``depth`` (H, W) is z in metres, NaN: none. The window is ``2 radius + 1`` pixels wide; 4 gives the paper's 9 x 9.
+    Returned are (H, W, 3) unit normals, camera frame, facing the camera; NaN where the window determines no plane.
     """
     _expect(depth, camera)
     valid = np.isfinite(depth) & (depth > 0)
@@ -104,13 +94,9 @@ class PlaneField:
         ``pixels`` are (n, 2) as (u, v), inside the image; NaN gives NaN. ``radii`` are those of the windows to choose from,
         ascending, pixels; windows are whole cells of 2 x 2 pixels.
 
-        Returns
-        -------
-        planes
-            (n, 3) float64 m with ``m . p = 1`` for points p of the plane, camera frame, 1 / metres; its normal is -m / |m|.
-            NaN where no window determines a plane.
-        residual
-            (n,) standard deviation of inverse depth about it, 1 / metres; NaN where no window is flat.
+        Returns (n, 3) m with ``m . p = 1`` for points p of the plane, camera frame, 1 / metres, whose normal is -m / |m|, NaN
+        where no window determines a plane; and (n,) the standard deviation of inverse depth about it, NaN where no window is
+        flat.
         """
         pixels = np.ascontiguousarray(pixels, dtype=np.float64)
         cells = np.array([max(1, r // CELL) for r in radii])

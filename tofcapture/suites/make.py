@@ -32,16 +32,9 @@ _RIGS_APART = 1_000_003
 def make_scene(
     recipe: Recipe, index: int, seed: int, meshes: Sequence[Path] = (), mesh_unit: str = "mm"
 ) -> Scene:
-    """Make scene ``index`` of a suite: a function of recipe, seed, index and meshes alone.
+    """Make scene ``index``, from 0, of a suite: more scenes never change the ones before.
 
-    Parameters
-    ----------
-    recipe, seed
-        The suite; the seed of the whole dataset.
-    index
-        From 0; more scenes never change the ones before.
-    meshes, mesh_unit
-        Files for the scenes of kind ``mesh`` (tof100), and their unit.
+    It is a function of recipe, seed of the dataset, index and, in scenes of kind ``mesh`` (tof100), of mesh files.
     """
     if recipe.name == "indoor":
         return rooms.make(recipe, index, seed)
@@ -122,10 +115,7 @@ def paths(out: Path, scene: str) -> tuple[Path, Path, Path]:
 
 
 def finished(spec: DatasetSpec, out: Path, index: int, scene: str) -> Made | None:
-    """Read the note of a scene whose shard is in place, and whole; ``None`` when there is none.
-
-    Raises :class:`ConfigError`: the scene is there, but of another spec.
-    """
+    """Read the note of a scene whose shard is in place, and whole; :class:`ConfigError` when it is of another spec."""
     _, note, shard = paths(out, scene)
     try:
         made = Made(**json.loads(note.read_text(encoding="utf-8")))

@@ -77,15 +77,7 @@ class _InWorld(Device):
 
 
 class SimArm(_InWorld, Arm):
-    """Simulated six-axis arm: a real arm's kinematics, its speed, its limits and its repeatability error.
-
-    Parameters
-    ----------
-    table
-        ``model``: ``ur10e`` or ``ur5e``.
-    context
-        The station; holds the simulated world.
-    """
+    """Simulated six-axis arm: kinematics, speed, limits and repeatability error of a real ``model``, ``ur10e`` or ``ur5e``."""
 
     simulated = True  # moves nothing that could hurt anyone
 

@@ -91,10 +91,7 @@ class Faults:
             raise DeviceError(f"fault on demand: the ToF camera lost burst {burst}")
 
     def before_points(self) -> bool:
-        """Move the arm before the stereo camera captures, as planned; tells whether the point map is to be empty.
-
-        Raises :class:`DeviceError`: as planned.
-        """
+        """Move the arm or raise :class:`DeviceError`, as planned; tells whether the point map is to be empty."""
         burst = self._bursts - 1
         self._wait(burst)
         if self._strikes(self._plan.stereo_fails, burst):

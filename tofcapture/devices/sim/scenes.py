@@ -52,13 +52,8 @@ def scene_objects(
 
     First come the objects (``target=True``), then table, pedestal, walls and clutter.
 
-    Parameters
-    ----------
-    name, seed
-        ``calibration`` for the board; a mesh's name; a family of :data:`shapes.FAMILIES`, optionally with ``-<n>`` behind
-        it (``mug``, ``mug-2``); anything else is a seeded combination of one to four objects (``random-7``).
-    meshes, mesh_unit
-        Name -> PLY, OBJ or STL file, and their unit: ``m``, ``cm`` or ``mm``.
+    ``name`` is ``calibration`` for the board, that of one of ``meshes``, or a family of :data:`shapes.FAMILIES`, optionally
+    with ``-<n>`` behind it (``mug``, ``mug-2``). Anything else is a seeded combination of one to four objects (``random-7``).
     """
     if name == CALIBRATION:
         return [*_calibration(), *surroundings(name, seed, clutter=False)]
