@@ -37,7 +37,7 @@ def write_plan(plan: Plan, stage: Stage, rig: Rig, target: Float64, title: str, 
         figure.set_size_inches(12, 7.6)
         figure.suptitle(f"{title}; {plan.summary()}", x=0.01, y=0.985, ha="left", fontsize=11)
         for column, (axes_of, words) in enumerate(_SIDES):
-            axes = figure.add_axes((0.05 + 0.49 * column, 0.19, 0.45, 0.45 * 12 / 7.6))
+            axes = figure.add_axes((0.05 + 0.5 * column, 0.19, 0.44, 0.44 * 12 / 7.6))
             shown = list(axes_of)
             axes.set_title(words, fontsize=9)
             axes.set_xlim(*(middle[0] + [-reach, reach]))
@@ -98,7 +98,7 @@ def _draw_refused(axes: Any, plan: Plan, shown: list[int]) -> None:
     lost = lost[:: max(1, -(-len(lost) // _DOTS))]
     for number, colour in enumerate(_REASONS):
         spots = plan.tried.spots[lost[plan.tried.refusal[lost] == number]]
-        axes.plot(*spots[:, shown].T, "o", color=colour, ms=2.5, mew=0, alpha=0.45)
+        axes.plot(*spots[:, shown].T, "o", color=colour, ms=2.5, mew=0, alpha=0.45, rasterized=True)
 
 
 def _draw_view(axes: Any, view: PlannedView, rig: Rig, shown: list[int], colour: str) -> None:
