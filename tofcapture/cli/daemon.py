@@ -14,22 +14,14 @@ from tofcapture.errors import ConfigError
 
 
 def _configure_daemon(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--root", type=Path, required=True, metavar="FOLDER", help="where recordings go")
-    parser.add_argument(
-        "--http",
-        metavar="127.0.0.1:PORT",
-        help="listen on loopback TCP too, for the page; port 0 takes a free one",
-    )
-    parser.add_argument(
-        "--station", type=Path, metavar="TOML", help="devices to use (default: all simulated)"
-    )
-    parser.add_argument(
-        "--state", type=Path, metavar="FOLDER", help="the daemon's own folder: queue, token, socket"
-    )
-    parser.add_argument(
-        "--allow-motion", action="store_true", help="let a real arm move, for as long as this daemon runs"
-    )
-    parser.add_argument("--print-unit", action="store_true", help="print a systemd unit and end")
+    add = parser.add_argument
+    add("--root", type=Path, required=True, metavar="FOLDER", help="where recordings go")
+    address = "listen on loopback TCP too, for the page; port 0 takes a free one"
+    add("--http", metavar="127.0.0.1:PORT", help=address)
+    add("--station", type=Path, metavar="TOML", help="devices to use (default: all simulated)")
+    add("--state", type=Path, metavar="FOLDER", help="the daemon's own folder: queue, token, socket")
+    add("--allow-motion", action="store_true", help="let a real arm move, while this daemon runs")
+    add("--print-unit", action="store_true", help="print a systemd unit and end")
 
 
 def _run_daemon(args: argparse.Namespace) -> Outcome:

@@ -23,15 +23,11 @@ TRAINING_MINUTES = 3
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder to fill (default demo-out)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the simulated station (default 0)")
-    parser.add_argument(
-        "--train",
-        action="store_true",
-        help=f"train a small network for {TRAINING_MINUTES} minutes instead of taking the bundled one",
-    )
+    add = parser.add_argument
+    add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder (default demo-out)")
+    add("--seed", type=int, default=0, help="seed of the simulated station (default 0)")
+    instead = f"train a small network for {TRAINING_MINUTES} minutes instead of taking the bundled one"
+    add("--train", action="store_true", help=instead)
 
 
 def _say(text: str) -> None:
@@ -68,29 +64,34 @@ class _Steps:
 def _run(args: argparse.Namespace) -> Outcome:
     out: Path = args.out
     recording, dataset, checked = out / "recording", out / "dataset", out / "dataset-true-rig"
-    results, report = out / "results.json", out / "report.html"
+    results, report, model = out / "results.json", out / "report.html", out / "model"
     out.mkdir(parents=True, exist_ok=True)
     trains = args.train or bundled_path() is None
     if trains and not args.train:
         _say(f"no trained network comes with this installation: training one for {TRAINING_MINUTES} minutes")
     steps = _Steps()
-    recorded = _record(steps, recording, args.seed)
+    to = ("--out", recording, "--seed", args.seed)
+    steps.run("record the board with holes", "record", "--calibration", "--views", BOARD_VIEWS, *to)
+    for scene in SCENES:
+        steps.run(f"record {scene}", "record", "--scene", scene, "--views", SCENE_VIEWS, *to)
+    views = [path for scene in SCENES for path in (recording / "views" / scene).glob("view-*.h5")]
     aligned = steps.run("align the two cameras", "align", recording)
     built = steps.run("build the shards", "build-dataset", recording, "--out", dataset)
-    true = steps.run(
-        "build once more with the true rig", "build-dataset", recording, "--out", checked, "--true-rig"
-    )
-    weights = _train(steps, dataset, out / "model") if trains else ()
+    again = ("build-dataset", recording, "--out", checked, "--true-rig")
+    true = steps.run("build once more with the true rig", *again)
+    weights: tuple[object, ...] = ()
+    if trains:
+        how = ("--preset", "demo", "--minutes", TRAINING_MINUTES)
+        steps.run("train a small network", "train", dataset, "--out", model, *how)
+        weights = ("--weights", model)
     tables = _evaluate(steps, dataset, results, weights, every=not trains)
     view = recording / "views" / SCENES[-1] / "view-000.h5"
     steps.run("predict one frame", "predict", view, *weights, "--out", out / "prediction")
-    steps.run(
-        "write the report",
-        *("report", "--dataset", dataset, "--results", results, "--evidence", recording / "evidence.json"),
-        *(*weights, "--out", report),
-    )
+    evidence = ("--evidence", recording / "evidence.json")
+    about = ("--dataset", dataset, "--results", results, *evidence, *weights)
+    steps.run("write the report", "report", *about, "--out", report)
     data = {
-        "views": recorded,
+        "views": len(views),
         "align": {k: aligned[k] for k in ("rotation_error_deg", "translation_error_mm")},
         "gt": true["gt"],
         "gt_aligned": built["gt"],
@@ -104,21 +105,6 @@ def _run(args: argparse.Namespace) -> Outcome:
     return Outcome(data=data, text=_text(data, out))
 
 
-def _record(steps: _Steps, recording: Path, seed: int) -> int:
-    """Record the board and all scenes; returns the views of the scenes."""
-    to = ("--out", recording, "--seed", seed)
-    steps.run("record the board with holes", "record", "--calibration", "--views", BOARD_VIEWS, *to)
-    for scene in SCENES:
-        steps.run(f"record {scene}", "record", "--scene", scene, "--views", SCENE_VIEWS, *to)
-    return sum(len(list((recording / "views" / scene).glob("view-*.h5"))) for scene in SCENES)
-
-
-def _train(steps: _Steps, dataset: Path, model: Path) -> tuple[object, ...]:
-    how = ("--preset", "demo", "--minutes", TRAINING_MINUTES)
-    steps.run("train a small network", "train", dataset, "--out", model, *how)
-    return "--weights", model
-
-
 def _evaluate(
     steps: _Steps, dataset: Path, results: Path, weights: tuple[object, ...], *, every: bool
 ) -> dict[str, dict[str, dict[str, float]]]:
@@ -129,19 +115,15 @@ def _evaluate(
     out = {}
     for split, (title, path) in splits.items():
         steps.run(title, "evaluate", dataset, *weights, "--split", split, "--out", path)
-        table = json.loads(path.read_text(encoding="utf-8"))
-        out[", ".join(table["scenes"])] = {name: _row(m) for name, m in table["methods"].items()}
+        found = json.loads(path.read_text(encoding="utf-8"))
+        out[", ".join(found["scenes"])] = {name: _row(m) for name, m in found["methods"].items()}
     return out
 
 
 def _row(method: dict[str, Any]) -> dict[str, float]:
-    depth, normal = method["depth"]["pixel"], method["normal"]["pixel"]
-    return {
-        "mae_mm": 1e3 * depth["mae"],
-        "rmse_mm": 1e3 * depth["rmse"],
-        "median_mm": 1e3 * depth["median"],
-        "normal_mean_deg": normal["mean_deg"],
-    }
+    depth = method["depth"]["pixel"]
+    row = {f"{name}_mm": 1e3 * depth[name] for name in ("mae", "rmse", "median")}
+    return {**row, "normal_mean_deg": method["normal"]["pixel"]["mean_deg"]}
 
 
 _COLUMNS = {
@@ -174,20 +156,20 @@ points: {data["prediction"]}/cloud.ply   depth, normals and pictures beside it
 
 
 def _next(network: str, out: Path) -> list[str]:
-    record = f"  tofcapture record --scene mug --views 25 --out {out / 'recording'}"
-    build = f"  tofcapture build-dataset {out / 'recording'} --out {out / 'dataset'}"
+    recording, dataset = out / "recording", out / "dataset"
+    record = f"  tofcapture record --scene mug --views 25 --out {recording}"
     if network == "bundled":
         return [
             "The bundled network was trained on other simulated scenes and has seen no real frame. Next:",
             record,
-            f"  tofcapture predict {out / 'recording'}/views/mug/view-000.h5 --out mug",
-            f"  tofcapture train {out / 'dataset'} --from bundled --out {out / 'fine-tuned'}",
+            f"  tofcapture predict {recording}/views/mug/view-000.h5 --out mug",
+            f"  tofcapture train {dataset} --from bundled --out {out / 'fine-tuned'}",
         ]
     return [
         f"This network is small and saw two simulated scenes for {TRAINING_MINUTES} minutes; it shows the way, not the limit. Next:",
         record,
-        build,
-        f"  tofcapture train {out / 'dataset'} --out {out / 'model-compact'} --preset compact",
+        f"  tofcapture build-dataset {recording} --out {dataset}",
+        f"  tofcapture train {dataset} --out {out / 'model-compact'} --preset compact",
     ]
 
 

@@ -305,15 +305,10 @@ def examinations(folder: Path, station: str, opening: str) -> tuple[list[Examina
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--station", type=Path, metavar="TOML", help="look at its devices too, without opening them"
-    )
-    parser.add_argument(
-        "--open", action="store_true", help="open the station's devices as well; nothing moves"
-    )
-    parser.add_argument(
-        "--folder", type=Path, default=Path(), help="where recordings would go (default: here)"
-    )
+    add = parser.add_argument
+    add("--station", type=Path, metavar="TOML", help="look at its devices too, without opening them")
+    add("--open", action="store_true", help="open the station's devices as well; nothing moves")
+    add("--folder", type=Path, default=Path(), help="where recordings would go (default: here)")
 
 
 def _run(args: argparse.Namespace) -> Outcome:

@@ -9,7 +9,7 @@ import argparse
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tofcapture.cli.kit import progress, table
 from tofcapture.cli.setup import station_path
@@ -26,51 +26,24 @@ _SCENE_VIEWS, _BOARD_VIEWS = 25, 12
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument(
-        "--scene", metavar="NAME", help="what stands on the table; names its folder in the recording"
-    )
+    add, what = parser.add_argument, parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--scene", metavar="NAME", help="what stands on the table; names its folder")
     what.add_argument("--calibration", action="store_true", help="views of the calibration board, for align")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="RECORDING",
-        help="folder to record into; resumed when it exists",
-    )
-    parser.add_argument(
-        "--views",
-        type=int,
-        help=f"number of views (default {_SCENE_VIEWS}, {_BOARD_VIEWS} for --calibration)",
-    )
-    parser.add_argument("--frames", type=int, default=10, help="ToF frames of each burst (default 10)")
-    parser.add_argument(
-        "--station", type=Path, metavar="TOML", help="devices to use (default: all simulated)"
-    )
-    parser.add_argument("--seed", type=int, help="seed of the simulated world and of the view plan")
-    parser.add_argument(
-        "--turns",
-        type=int,
-        default=1,
-        metavar="N",
-        help="have the object turned by hand between views, N ways in all (default 1: it stays)",
-    )
-    parser.add_argument(
-        "--dry-run",
-        action="store_true",
-        help="print the plan and draw it; nothing moves, nothing is recorded",
-    )
-    parser.add_argument(
-        "--picture", type=Path, metavar="SVG", help="where --dry-run draws it (default: beside RECORDING)"
-    )
-    parser.add_argument(
-        "--allow-motion",
-        action="store_true",
-        help="let a real arm move in this run (rehearse the plan first); simulated arms need no leave",
-    )
-    parser.add_argument(
-        "--foreground", action="store_true", help="record here, also when a daemon keeps this recording"
-    )
+    into = "folder to record into; resumed when it exists"
+    add("--out", type=Path, required=True, metavar="RECORDING", help=into)
+    number = f"number of views (default {_SCENE_VIEWS}, {_BOARD_VIEWS} for --calibration)"
+    add("--views", type=int, help=number)
+    add("--frames", type=int, default=10, help="ToF frames of each burst (default 10)")
+    add("--station", type=Path, metavar="TOML", help="devices to use (default: all simulated)")
+    add("--seed", type=int, help="seed of the simulated world and of the view plan")
+    turned = "have the object turned by hand between views, N ways in all (default 1: it stays)"
+    add("--turns", type=int, default=1, metavar="N", help=turned)
+    add("--dry-run", action="store_true", help="print the plan and draw it; nothing moves or is recorded")
+    drawn = "where --dry-run draws it (default: beside RECORDING)"
+    add("--picture", type=Path, metavar="SVG", help=drawn)
+    leave = "let a real arm move in this run (rehearse the plan first); simulated arms need no leave"
+    add("--allow-motion", action="store_true", help=leave)
+    add("--foreground", action="store_true", help="record here, also when a daemon keeps this recording")
 
 
 def _run(args: argparse.Namespace) -> Outcome:
@@ -175,27 +148,17 @@ def _plan_table(plan: Plan) -> str:
 
 
 def _recorded(recording: Path, result: RecordResult) -> Outcome:
-    taken, kept = len(result.recorded), len(result.kept)
+    taken, kept, plan = len(result.recorded), len(result.kept), result.plan
     lines = [*result.repaired, *result.reasons, *result.notes]
-    if not taken and not result.failed:
-        lines.append(f"nothing to record: {kept} views of {result.scene!r} are there")
+    if taken or result.failed:
+        failed = f"{len(result.failed)} failed: {recording}"
+        lines.append(f"{taken} views of {result.scene!r} recorded, {kept} were there, {failed}")
     else:
-        lines.append(
-            f"{taken} views of {result.scene!r} recorded, {kept} were there, {len(result.failed)} failed: {recording}"
-        )
-    lines += result.plan.shortfall()
-    data: dict[str, Any] = {
-        "ok": not result.failed,
-        "recording": str(recording),
-        "scene": result.scene,
-        "recorded": list(result.recorded),
-        "kept": list(result.kept),
-        "failed": list(result.failed),
-        "reasons": list(result.reasons),
-        "notes": list(result.notes),
-        "repaired": list(result.repaired),
-        "plan": {"digest": result.plan.digest, "views": len(result.plan.views), "wanted": result.plan.wanted},
-    }
+        lines.append(f"nothing to record: {kept} views of {result.scene!r} are there")
+    lines += plan.shortfall()
+    data = {key: value for key, value in vars(result).items() if key != "plan"}
+    planned = {"digest": plan.digest, "views": len(plan.views), "wanted": plan.wanted}
+    data |= {"ok": not result.failed, "recording": str(recording), "plan": planned}
     return Outcome(data=data, text="\n".join(lines), exit_code=4 if result.failed else 0)
 
 

@@ -23,13 +23,7 @@ _LONGEST = 1 << 24  # bytes of a header; a file that claims more is no checkpoin
 
 
 def station_path(flag: Path | None) -> tuple[Path | None, str]:
-    """Find the station file that holds, ``None`` for the packaged one, and who named it.
-
-    Parameters
-    ----------
-    flag
-        What ``--station`` says.
-    """
+    """Find the station file that holds, ``None`` for the packaged one, and who named it: ``--station`` is ``flag``."""
     if flag is not None:
         return flag, "--station"
     if given := os.environ.get("TOFCAPTURE_STATION"):
@@ -85,16 +79,12 @@ def describe_weights(path: Path) -> BundledWeights:
 
 def _configure_config(parser: argparse.ArgumentParser) -> None:
     parts = parser.add_subparsers(dest="what", metavar="WHAT", required=True, parser_class=type(parser))
-    show = parts.add_parser("show", help="print what holds", description="print what holds")
-    show.add_argument("--origin", action="store_true", help="say of each value where it comes from")
-    show.add_argument(
-        "--station",
-        type=Path,
-        metavar="TOML",
-        help="station (default: $TOFCAPTURE_STATION, else the simulated one)",
-    )
-    show.add_argument("--seed", type=int, help="as record takes it")
-    show.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    add = parts.add_parser("show", help="print what holds", description="print what holds").add_argument
+    add("--origin", action="store_true", help="say of each value where it comes from")
+    station = "station (default: $TOFCAPTURE_STATION, else the simulated one)"
+    add("--station", type=Path, metavar="TOML", help=station)
+    add("--seed", type=int, help="as record takes it")
+    add("--json", action="store_true", help="print the result as one JSON object")
 
 
 def _leaves(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
