@@ -1,5 +1,6 @@
 """The daemon's API: who may ask, what is refused and how, and a recording from the queue to the sealed view."""
 
+import dataclasses
 import http.client
 import json
 import os
@@ -65,21 +66,10 @@ class Daemon:
 @contextmanager
 def running(folder, *options, port=0, **env):
     """Start a daemon; end it by its id."""
-    command = [
-        sys.executable,
-        STATION,
-        "daemon",
-        folder / "root",
-        folder / "st",
-        "--http",
-        f"127.0.0.1:{port}",
-    ]
-    process = subprocess.Popen(
-        [*command, *options],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **{k: str(v) for k, v in env.items()}},
-    )
+    where = (folder / "root", folder / "st", "--http", f"127.0.0.1:{port}")
+    command = [sys.executable, STATION, "daemon", *where, *options]
+    full = {**os.environ, **{k: str(v) for k, v in env.items()}}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=full)
     try:
         yield Daemon(folder, process)
     finally:
@@ -340,51 +330,30 @@ def test_page_is_static_and_strict(daemon):
         assert b"https://" not in body
 
 
+GOOD = {"scene": "a", "recording": "b"}
+WRONG_JOBS = [
+    ("malformed", '{"scene": ', 400),
+    ("not UTF-8", b'{"scene": "\xff"}', 400),
+    ("NaN", json.dumps({**GOOD, "views": float("nan")}), 400),
+    ("too deep", "[" * 30000, 400),
+    ("oversized", json.dumps({"scene": "a" * 70000}), 413),
+    ("a list", "[]", 422),
+    ("unknown field", json.dumps({**GOOD, "station": "/etc/passwd"}), 422),
+    *((f"scene {name!r}", json.dumps({**GOOD, "scene": name}), 422) for name in ("../../etc", "a\n", "")),
+    *((f"recording {name!r}", json.dumps({**GOOD, "recording": name}), 422) for name in ("../b", "/etc", 3)),
+    *((f"views {n!r}", json.dumps({**GOOD, "views": n}), 422) for n in (True, 0, 1001, 1.5, "3", None)),
+]
+FORM = {**VERB, "Content-Type": "application/x-www-form-urlencoded"}
 REFUSED = [
     ("foreign Host", "GET", "/v1/state", {"Host": "evil.example"}, None, 403),
     ("rebound Host", "POST", "/v1/stop", {**VERB, "Host": "evil.example:80"}, "{}", 403),
     ("foreign Origin", "GET", "/v1/state", {"Origin": "http://evil.example"}, None, 403),
     ("null Origin", "POST", "/v1/stop", {**VERB, "Origin": "null"}, "{}", 403),
     ("cross-site", "GET", "/v1/state", {"Sec-Fetch-Site": "cross-site"}, None, 403),
-    (
-        "text/plain",
-        "POST",
-        "/v1/jobs",
-        {**VERB, "Content-Type": "text/plain"},
-        '{"scene": "a", "recording": "b"}',
-        415,
-    ),
-    ("a form", "POST", "/v1/stop", {**VERB, "Content-Type": "application/x-www-form-urlencoded"}, "a=b", 415),
+    ("text/plain", "POST", "/v1/jobs", {**VERB, "Content-Type": "text/plain"}, json.dumps(GOOD), 415),
+    ("a form", "POST", "/v1/stop", FORM, "a=b", 415),
     ("no header", "POST", "/v1/stop", {"Content-Type": "application/json"}, "{}", 403),
-    ("malformed", "POST", "/v1/jobs", VERB, '{"scene": ', 400),
-    ("not UTF-8", "POST", "/v1/jobs", VERB, b'{"scene": "\xff"}', 400),
-    ("NaN", "POST", "/v1/jobs", VERB, '{"scene": "a", "recording": "b", "views": NaN}', 400),
-    ("too deep", "POST", "/v1/jobs", VERB, "[" * 30000, 400),
-    ("a list", "POST", "/v1/jobs", VERB, "[]", 422),
-    (
-        "unknown field",
-        "POST",
-        "/v1/jobs",
-        VERB,
-        '{"scene": "a", "recording": "b", "station": "/etc/passwd"}',
-        422,
-    ),
-    ("traversal", "POST", "/v1/jobs", VERB, '{"scene": "../../etc", "recording": "b"}', 422),
-    ("traversal in the recording", "POST", "/v1/jobs", VERB, '{"scene": "a", "recording": "../b"}', 422),
-    ("a newline", "POST", "/v1/jobs", VERB, '{"scene": "a\\n", "recording": "b"}', 422),
-    ("an absolute path", "POST", "/v1/jobs", VERB, '{"scene": "a", "recording": "/tmp"}', 422),
-    *(
-        (
-            f"views {wrong}",
-            "POST",
-            "/v1/jobs",
-            VERB,
-            json.dumps({"scene": "a", "recording": "b", "views": wrong}),
-            422,
-        )
-        for wrong in (True, 0, 1001, 1.5, "3", None)
-    ),
-    ("oversized", "POST", "/v1/jobs", VERB, json.dumps({"scene": "a" * 70000}), 413),
+    *((name, "POST", "/v1/jobs", VERB, body, code) for name, body, code in WRONG_JOBS),
     ("wrong verb", "DELETE", "/v1/jobs", VERB, "{}", 405),
     ("no such job", "GET", "/v1/jobs/999999", {}, None, 404),
     ("a path for a picture", "GET", "/v1/preview/..%2f..%2ftoken", {}, None, 404),
@@ -458,6 +427,9 @@ def test_slow_headers_are_cut_off(tmp_path):
 def test_openapi_is_what_is_served(daemon):
     """docs/openapi.json is generated from the routes that serve it."""
     from tofcapture.record.daemon.app import document
+    from tofcapture.record.daemon.store import Job
 
     stored = json.loads((ROOT / "docs" / "openapi.json").read_text(encoding="utf-8"))
     assert stored == document() == daemon.ask("GET", "/openapi.json"), "make docs"
+    known = {field.name for field in dataclasses.fields(Job)}
+    assert stored["components"]["schemas"]["Job"]["properties"].keys() == known

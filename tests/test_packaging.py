@@ -80,7 +80,7 @@ def test_wheel_holds_the_packages_and_nothing_else(wheel):
     }
     shipped = [
         p
-        for g in ("*.toml", "*.j2", "*.js", "*.css", "*.html", "py.typed")
+        for g in ("*.toml", "*.j2", "*.js", "*.json", "*.css", "*.html", "*.service", "py.typed")
         for p in (ROOT / "tofcapture").rglob(g)
     ]
     shipped += [
