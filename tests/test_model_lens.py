@@ -37,7 +37,7 @@ from tofcapture_model.geometry.intrinsics import (
 )
 from tofcapture_model.geometry.maps import depth_to_normals, propagate_depth, unproject
 from tofcapture_model.geometry.multipath import _patches, cues
-from tofcapture_model.inference import onnx_backend
+from tofcapture_model.inference import export as exporting
 from tofcapture_model.inference import predict as predicting
 from tofcapture_model.inference.predict import Predictor, predict
 from tofcapture_model.training.train import train
@@ -345,8 +345,8 @@ def test_an_export_made_before_lenses_were_known_says_what_to_do(tmp_path, monke
 
     weights = save_network(tmp_path, preset("demo"))
     weights.with_suffix(".onnx").write_bytes(b"")
-    monkeypatch.setattr(onnx_backend, "open_onnx", lambda _: Old())
-    monkeypatch.setattr(onnx_backend, "config_of", lambda *_: preset("demo"))
+    monkeypatch.setattr(exporting, "open_onnx", lambda _: Old())
+    monkeypatch.setattr(exporting, "config_of", lambda *_: preset("demo"))
     ask = Predictor(weights, backend="onnx")
     assert ask(wall(SMALL), TofInfo("t", "", SMALL, np.zeros(3))).depth.shape == (72, 96)
     lens = replace(SMALL, distortion=(-0.1, 0.02, 0.001, 0.002, 0.0))
