@@ -203,9 +203,16 @@ def _uncertainty(influence: Float64, covariance: Float64) -> dict[str, Any]:
     }
 
 
+def degrees_mm(rotation: float, translation: float, suffix: str = "") -> dict[str, float]:
+    """Lay radians and metres out as ``rotation_deg`` and ``translation_mm``."""
+    return {
+        f"rotation{suffix}_deg": float(np.degrees(rotation)),
+        f"translation{suffix}_mm": 1e3 * float(translation),
+    }
+
+
 def _lengths(variances: Float64) -> dict[str, float]:
-    moved, turned = np.sqrt(variances[:3].sum()), np.sqrt(variances[3:].sum())
-    return {"rotation_deg": float(np.degrees(turned)), "translation_mm": float(1e3 * moved)}
+    return degrees_mm(np.sqrt(variances[3:].sum()), np.sqrt(variances[:3].sum()))
 
 
 def _left_out(solution: Solution, fused: Float64) -> tuple[Float64, Float64]:
@@ -223,8 +230,5 @@ def _weighted(solution: Solution, used: Sequence[int]) -> Float64:
 
 
 def _stated(T_tof_stereo: Float64, true: Float64 | None) -> dict[str, Any]:
-    out: dict[str, Any] = {"T_tof_stereo": T_tof_stereo.tolist()}
-    if true is not None:
-        rotation, translation = alignment_error(T_tof_stereo, true)
-        out |= {"rotation_error_deg": float(np.degrees(rotation)), "translation_error_mm": 1e3 * translation}
-    return out
+    error = {} if true is None else degrees_mm(*alignment_error(T_tof_stereo, true), "_error")
+    return {"T_tof_stereo": T_tof_stereo.tolist(), **error}
