@@ -90,6 +90,29 @@ def test_folder_is_refused_or_made_private(tmp_path):
         settings.open_folder(tmp_path / ("x" * 120))
 
 
+def test_the_pace_is_that_of_the_recorder_at_work(monkeypatch):
+    """After a crash the time left counts from the new recorder's plan, with the views that it has sealed."""
+    from tofcapture.record.daemon.supervisor import Progress
+
+    now, progress = [0.0], Progress()
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    plan = {"kind": "planned", "views": [{"index": i, "state": "planned"} for i in range(6)]}
+    sealed = {"kind": "sealed", "quality": {}, "sha256": "x"}
+    progress.begin(1)
+    for seconds, message in (
+        *(
+            (0, plan),
+            (10, {**sealed, "index": 0}),
+            (20, {**sealed, "index": 1}),
+            (100, {"kind": "opened", "simulated": True}),
+        ),
+        *((200, {**plan, "views": plan["views"][2:]}), (230, {**sealed, "index": 2})),
+    ):
+        now[0] = seconds
+        progress.hear(message)
+    assert progress.counts() == {"sealed": 1, "failed": 0, "total": 4, "eta_s": 90.0}
+
+
 def test_full_disks_are_told_apart():
     """Full in the words of the system, of SQLite and of HDF5; other errors are none of it."""
     assert is_full(OSError(errno.ENOSPC, "x"))

@@ -103,7 +103,7 @@ class Progress:
         self.simulated: bool | None = None
         self.resting = False
         self.sealed_now = 0
-        self._since = 0.0
+        self._since, self._sealed_then = 0.0, 0  # when the recorder at work began, and what was sealed before
 
     def begin(self, job: int) -> None:
         """Forget the job before; a job that goes on after a crash keeps its table until the new plan comes."""
@@ -124,7 +124,7 @@ class Progress:
         elif kind == "planned":
             # What was measured of a view before the recorder was started anew still holds.
             self.views = {v["index"]: {**self.views.get(v["index"], {}), **v} for v in message["views"]}
-            self._since = time.monotonic()
+            self._since, self._sealed_then = time.monotonic(), self.sealed_now
         elif kind == "step" and message["step"] != "failed":
             self.doing = {"index": message["index"], "step": message["step"]}
         elif kind in {"sealed", "failed"}:
@@ -142,7 +142,8 @@ class Progress:
         """Count views sealed, failed and planned; tell the seconds left at the present pace."""
         states = Counter(view["state"] for view in self.views.values())
         left = states.total() - states["sealed"] - states["failed"]
-        pace = (time.monotonic() - self._since) / self.sealed_now if self.sealed_now else None
+        fresh = self.sealed_now - self._sealed_then
+        pace = (time.monotonic() - self._since) / fresh if fresh else None
         return {
             "sealed": states["sealed"],
             "failed": states["failed"],
