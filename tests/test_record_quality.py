@@ -6,14 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.test_recorder import VIEWS, Bench, _few_candidates, _record
+from tests.test_recorder import VIEWS, Bench, _few_candidates, _record, rows
 from tofcapture.camera import Camera
 from tofcapture.devices.console import ConsoleOperator
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.files.view import read_view, view_path
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
 from tofcapture.poses import rotation_exp, transform
-from tofcapture.record.journal import Journal
 from tofcapture.record.quality import LIMITS, NOTE, REFUSE, RETAKE, broken_limits, measure, quality_table
 from tofcapture.rig import Rig
 
@@ -166,9 +165,7 @@ def test_dropped_frames_are_retaken_then_noted(tmp_path, bad, attempts, noted):
     assert result.recorded == (0,)
     assert all(note.startswith("view 0: ") for note in result.notes)
     assert sum("dropped" in note for note in result.notes) == noted
-    journal = Journal(tmp_path)
-    assert [row.attempts for row in journal.rows()] == [attempts]
-    journal.close()
+    assert [row.attempts for row in rows(tmp_path)] == [attempts]
     quality = read_view(view_path(tmp_path, "mug", 0)).provenance["quality"]
     assert sum(note["check"] == "frame_drops" for note in quality["notes"]) == noted
     assert quality["frame_drops"] == noted

@@ -3,6 +3,7 @@
 import json
 import os
 import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -111,6 +112,12 @@ def _record(out, bench=None, scene="mug", views=VIEWS, frames=FRAMES, **options)
     return record((bench or Bench()).station(), scene, out, views=views, frames=frames, **options)
 
 
+def rows(out, scene=None):
+    """What the journal says of each view."""
+    with closing(Journal(out)) as journal:
+        return journal.rows(scene)
+
+
 def _arrays(out, scene="mug"):
     """Bytes of every array of every view."""
     found = {}
@@ -134,11 +141,9 @@ def test_records_every_view_in_order(tmp_path):
     assert bench.steps[0] == "place mug"
     assert "".join(s[0] for s in bench.steps[1:]).count("tss") == VIEWS
     assert (tmp_path / "r" / "station.toml").is_file()
-    journal = Journal(tmp_path / "r")
-    rows = journal.rows("mug")
-    journal.close()
-    assert [row.state for row in rows] == ["sealed"] * VIEWS
-    for row in rows:
+    found = rows(tmp_path / "r", "mug")
+    assert [row.state for row in found] == ["sealed"] * VIEWS
+    for row in found:
         view = read_view(view_path(tmp_path / "r", "mug", row.index))
         assert (view.scene, view.index) == ("mug", row.index)
         assert view.provenance["pose"] == row.pose
@@ -275,9 +280,7 @@ def test_motion_during_exposure_is_retaken(tmp_path):
 
     bench.before = drift
     assert _record(tmp_path, bench, views=2).recorded == (0, 1)
-    journal = Journal(tmp_path)
-    assert sorted(row.attempts for row in journal.rows()) == [1, 2]
-    journal.close()
+    assert sorted(row.attempts for row in rows(tmp_path)) == [1, 2]
 
 
 def test_a_view_that_never_works_is_given_up(tmp_path):

@@ -6,7 +6,7 @@ import sqlite3
 
 import pytest
 
-from tests.test_recorder import VIEWS, Bench, _arrays, _few_candidates, _record
+from tests.test_recorder import VIEWS, Bench, _arrays, _few_candidates, _record, rows
 from tofcapture.errors import BusyError, DeviceError
 from tofcapture.frames import ArmInfo
 from tofcapture.record import recorder, resources
@@ -52,9 +52,7 @@ def test_every_step_is_journaled_before_it_begins(tmp_path):
     words = [word for word, _ in witness.told[1:]]
     assert words == ["view", *STEPS, "sealed"] * VIEWS
     assert witness.journaled == list(STEPS) * VIEWS
-    journal = Journal(tmp_path)
-    assert {row.step for row in journal.rows()} == {""}
-    journal.close()
+    assert {row.step for row in rows(tmp_path)} == {""}
 
 
 @pytest.mark.parametrize("stop_at", [1, 6, 7, 8, 16])
@@ -86,9 +84,7 @@ def test_a_stopped_arm_is_no_failed_view(tmp_path):
     bench.before = refuse
     with pytest.raises(Stopped):
         _record(tmp_path, bench, observer=Stopping())
-    journal = Journal(tmp_path)
-    assert {row.state for row in journal.rows()} == {"planned"}
-    journal.close()
+    assert {row.state for row in rows(tmp_path)} == {"planned"}
 
 
 @pytest.mark.parametrize("number", range(1, 44, 6))

@@ -64,10 +64,7 @@ def journal_path(recording: Path) -> Path:
 def open_database(path: Path, schema: str, what: str, hint: str) -> sqlite3.Connection:
     """Open an SQLite database whose every transaction is on disk when its call returns.
 
-    Raises
-    ------
-    DataError
-        The file is no such database.
+    Raises :class:`DataError`: the file is no such database.
     """
     try:
         db = sqlite3.connect(path, isolation_level=None)
@@ -104,10 +101,7 @@ class Journal:
     def agree(self, facts: Mapping[str, Any]) -> None:
         """Remember facts of the recording (name -> JSON types), or compare with the remembered ones.
 
-        Raises
-        ------
-        ConfigError
-            A fact differs from what the recording was begun with.
+        Raises :class:`ConfigError`: a fact differs from what the recording was begun with.
         """
         for key, value in facts.items():
             text = json.dumps(value, sort_keys=True)
@@ -122,10 +116,7 @@ class Journal:
     def expect(self, scene: str, poses: Mapping[int, str]) -> set[int]:
         """Note planned views (index -> digest of the pose) and say which of them are there already.
 
-        Raises
-        ------
-        ConfigError
-            A view of that number was recorded at another pose.
+        Raises :class:`ConfigError`: a view of that number was recorded at another pose.
         """
         sealed = {row.index: row.pose for row in self.rows(scene) if row.state == "sealed"}
         for index in sorted(sealed.keys() & poses.keys()):

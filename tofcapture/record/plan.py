@@ -120,10 +120,7 @@ class Plan:
 def plan_scene(station: Station, scene: str, views: int, turns: int = 1) -> Plan:
     """Plan the views of a scene on a station: its arm, its rig, its ``[plan]``, its seed.
 
-    Raises
-    ------
-    ConfigError
-        The name is no safe file name, no view is wanted, the board shall be turned, or not one view can be reached.
+    Raises :class:`ConfigError`: the name is no safe file name, no view is wanted, the board shall be turned, or not one view can be reached.
     """
     check_scene_name(scene)
     if views < 1:

@@ -55,13 +55,7 @@ def full_disk_named(where: Path) -> Iterator[None]:
 
 
 def check_space(recording: Path, views: int) -> None:
-    """Refuse to begin what the disk cannot hold.
-
-    Raises
-    ------
-    DiskFull
-        There is no room for so many views.
-    """
+    """Refuse to begin what the disk cannot hold. Raises :class:`DiskFull`: there is no room for so many views."""
     free = shutil.disk_usage(recording).free
     needed = views * _VIEW_BYTES + _RESERVE_BYTES
     if free < needed:
@@ -75,10 +69,7 @@ def check_space(recording: Path, views: int) -> None:
 def hold_file(path: Path, what: str, hint: str) -> Iterator[None]:
     """Hold a lock file that names this process; the lock goes with the process, however that ends.
 
-    Raises
-    ------
-    BusyError
-        Another process holds it: ``what``, its id, ``hint``.
+    Raises :class:`BusyError`: another process holds it: ``what``, its id, ``hint``.
     """
     with path.open("a+", encoding="ascii") as file:
         try:
@@ -96,10 +87,7 @@ def hold_file(path: Path, what: str, hint: str) -> Iterator[None]:
 def hold_arm(arm: Arm) -> Iterator[None]:
     """Hold a real arm for this process: two recorders of two recordings must not move it in turn.
 
-    Raises
-    ------
-    BusyError
-        Another process of this machine moves it.
+    Raises :class:`BusyError`: another process of this machine moves it.
     """
     if arm.simulated:
         yield
@@ -124,10 +112,7 @@ def hold_arm(arm: Arm) -> Iterator[None]:
 def check_motion_allowed(station: Station, allowed: bool, hint: str) -> None:
     """Refuse to begin with a real arm that nobody allowed to move.
 
-    Raises
-    ------
-    MotionRefused
-        The arm is real, and ``--allow-motion`` was not given; ``hint`` says what to do.
+    Raises :class:`MotionRefused`: the arm is real, and ``--allow-motion`` was not given; ``hint`` says what to do.
     """
     if not (station.simulated or allowed):
         model = station.arm.describe().model

@@ -41,10 +41,7 @@ PARAMETERS: Schema = _TOLD["parameters"]  # of paths, queries and headers
 def check(schema: Mapping[str, Any], value: Any, where: str = "body") -> None:
     """Make sure that a value is what a schema of this module says.
 
-    Raises
-    ------
-    UsageError
-        The first thing that is wrong.
+    Raises :class:`UsageError`: the first thing that is wrong.
     """
     if schema["type"] == "object":
         if not isinstance(value, dict):

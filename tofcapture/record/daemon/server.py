@@ -32,13 +32,7 @@ Address = tuple[str, int]
 
 
 def tcp_address(text: str) -> Address:
-    """Read ``127.0.0.1:8765``.
-
-    Raises
-    ------
-    UsageError
-        It is no loopback address with a port.
-    """
+    """Read ``127.0.0.1:8765``. Raises :class:`UsageError`: it is no loopback address with a port."""
     host, _, port = text.rpartition(":")
     host = {"localhost": "127.0.0.1"}.get(host, host.strip("[]"))
     try:

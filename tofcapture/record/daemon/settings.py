@@ -50,10 +50,7 @@ def state_folder(root: Path | None) -> StateFolder:
 def open_folder(root: Path | None) -> StateFolder:
     """Make the folder, or make sure that it is this user's and nobody else can look into it.
 
-    Raises
-    ------
-    ConfigError
-        It belongs to another user, or its path is too long for a socket.
+    Raises :class:`ConfigError`: it belongs to another user, or its path is too long for a socket.
     """
     state = state_folder(root)
     if not state.socket_fits:
@@ -92,10 +89,7 @@ def token_of(state: StateFolder) -> str:
 def only_one(state: StateFolder) -> Iterator[None]:
     """Hold the folder: one daemon per folder. A socket that a dead one left is removed.
 
-    Raises
-    ------
-    BusyError
-        A daemon is running.
+    Raises :class:`BusyError`: a daemon is running.
     """
     with hold_file(state.root / "lock", f"{state.root}: a daemon is running", "tofcapture status"):
         state.socket.unlink(missing_ok=True)

@@ -91,10 +91,7 @@ class Store:
     def add(self, request: Mapping[str, Any]) -> tuple[Job, bool]:
         """Queue a job, or find the one that the same request made; the second value tells whether it is new.
 
-        Raises
-        ------
-        BusyError
-            The same request id asked for something else, or too many jobs wait.
+        Raises :class:`BusyError`: the same request id asked for something else, or too many jobs wait.
         """
         name = request.get("request_id")
         if name is not None and (known := self._jobs("WHERE request_id = ?", name)):
@@ -115,13 +112,7 @@ class Store:
         return self.job(int(made or 0)), True
 
     def job(self, number: int) -> Job:
-        """Find a job.
-
-        Raises
-        ------
-        DataError
-            There is none of that number.
-        """
+        """Find a job. Raises :class:`DataError`: there is none of that number."""
         if not (found := self._jobs("WHERE id = ?", number)):
             raise DataError(f"there is no job {number}")
         return found[0]

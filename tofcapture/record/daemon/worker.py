@@ -76,10 +76,7 @@ class DaemonLink(Observer):
     def ask(self, scene: str) -> None:
         """Wait until a person says that the scene is placed.
 
-        Raises
-        ------
-        DeviceError
-            Nobody answers: the arm stays where it is.
+        Raises :class:`DeviceError`: nobody answers: the arm stays where it is.
         """
         self.confirmed = False
         self.tell("ask", scene=scene)
