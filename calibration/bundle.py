@@ -51,8 +51,8 @@ class Bundle:
     T_flange_tof: Float64
     T_flange_stereo: Float64
     T_base_board: Float64
-    #: (18, 18) of (displacement of the origin, rotation vector) of the three, in the axes of flange, flange and base. The
-    #: stated covariances times ``variance``
+    #: (18, 18) of (displacement of the origin, rotation vector) of the three, in the axes of flange,
+    #: flange and base. The stated covariances times ``variance``
     covariance: Float64
     variance: float  #: What the residuals say the stated covariances must be multiplied by; never below one
     weight: Float64  #: (K,) of the fits; those below ``OUTLIER`` are ``outliers``

@@ -105,6 +105,24 @@ LIMITS: dict[str, Limit] = {
     ),
 }  # fmt: skip
 
+LENS = {
+    "rms": Limit(
+        "distance of rims to the board's edges", 0.4, 0.8, "px",
+        "a bent board, another board's file, or a camera that moved during the exposure",
+    ),
+    "left_out": Limit("the same at views left out", 0.5, 1.0, "px", "too few views for this lens, or one bad view"),
+    "pixel_sigma": Limit(
+        "1-sigma of a ray", 0.3, 1.0, "px", "more views, tilted 20 to 40 degrees in all directions, at several distances",
+    ),
+    "coverage": Limit(
+        "share of width and height covered", 0.75, 0.5, "", "views with the board's edge in every corner of the image",
+    ),
+}  # fmt: skip
+RANGE_LEFT = Limit(
+    "error left at views that were not fitted, RMS by view and part of the image", 1.0, 2.5, "mm",
+    "light thrown back by the surroundings, too few views, or a sensor that was still warming up",
+)  # fmt: skip
+
 SIGNIFICANT = 0.01  # probability of a drift as large by chance below which it counts as real
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.hand_eye.closed_form import invert_all
-from calibration.hand_eye.time_offset import make_stream
+from calibration.hand_eye.pairs import make_stream
 from tofcapture.poses import exp, invert, look_at, rotation_angle, rotation_exp, transform
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import re
 import struct
 import xml.etree.ElementTree as ET
@@ -18,7 +17,7 @@ from calibration.board.detector import detect
 from calibration.board.drawing import describe, dxf, stl, svg
 from calibration.board.fit import Model, Sight, on_front, refine
 from calibration.board.geometry import Board, board_from, distance_to_ring, inside, load_board, symmetries
-from calibration.cli.calibrate import COMMAND
+from tests.commands import calibrate
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.shapes import BOARD_SIZE
 from tofcapture.devices.sim.shapes import board as simulated_board
@@ -139,11 +138,9 @@ def test_stl_encloses_the_boards_volume():
 
 def test_board_command_writes_all_three(tmp_path):
     """The command writes what was asked for and describes the board."""
-    parser = argparse.ArgumentParser()
-    COMMAND.configure(parser)
     names = [str(tmp_path / f"b.{kind}") for kind in ("svg", "dxf", "stl")]
     words = ["board", "--svg", names[0], "--dxf", names[1], "--stl", names[2]]
-    outcome = COMMAND.run(parser.parse_args(words))
+    outcome = calibrate(*words)
     assert all(Path(name).stat().st_size > 500 for name in names)
     assert "7 holes" in outcome.text
     assert outcome.data["symmetries"] == []

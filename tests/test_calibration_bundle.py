@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calibration.bundle import ARM_SIGMA, BoardFit, solve_bundle
-from calibration.cli.bundle import consistency
-from calibration.hand_eye.refusal import Cause, HandEyeRefused
+from calibration.cli.hand_eye import consistency
+from calibration.hand_eye.checks import Cause, HandEyeRefused
 from tofcapture import poses
 from tofcapture.errors import QualityError
 

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.hand_eye.closed_form import daniilidis, invert_all, park_martin, residuals, shah
-from calibration.hand_eye.files import read_csv, read_pairs
-from calibration.hand_eye.refine import jacobian
-from calibration.hand_eye.refusal import Cause, HandEyeRefused
-from calibration.hand_eye.solve import refine_from_consensus, solve_hand_eye, to_dict
-from calibration.hand_eye.time_offset import coarse_offset, make_stream, pairs_at, refine_offset
+from calibration.hand_eye.checks import Cause, HandEyeRefused
+from calibration.hand_eye.closed_form import invert_all, park_martin, residuals, shah
+from calibration.hand_eye.files import read_pairs, read_poses
+from calibration.hand_eye.pairs import make_stream, stream_pairs
+from calibration.hand_eye.refine import jacobian, refined_from_consensus
+from calibration.hand_eye.solve import solve_hand_eye, to_dict
 from tests.hand_eye import apart, station, streams
 from tofcapture.errors import DataError
 from tofcapture.poses import exp, invert, rotation_exp, rotation_log, transform
@@ -46,7 +46,7 @@ def test_exact_pairs_give_the_exact_answer(seed, eye_to_hand):
         assert moved < 1e-6
 
 
-@pytest.mark.parametrize("method", [park_martin, daniilidis, lambda P, B: shah(P, B)[0]])
+@pytest.mark.parametrize("method", [park_martin, lambda P, B: shah(P, B)[0]])
 @given(seed=seeds)
 @few
 def test_closed_forms_do_not_see_the_base(method, seed):
@@ -56,17 +56,6 @@ def test_closed_forms_do_not_see_the_base(method, seed):
     turned, moved = apart(method(base @ A, B), method(A, B))
     assert turned < 1e-6
     assert moved < 1e-6
-
-
-def test_daniilidis_is_blind_to_quaternion_signs():
-    """Rotations beyond half a turn, where quaternions change sign, leave the dual-quaternion answer right."""
-    rng = np.random.default_rng(3)
-    X, Z = exp(rng.normal(0, 0.5, 6)), exp(rng.normal(0, 0.5, 6))
-    A = np.stack([exp(rng.normal(0, [0.3, 0.3, 0.3, 2, 2, 2])) for _ in range(12)])
-    B = np.stack([invert(X) @ invert(a) @ Z for a in A])
-    turned, moved = apart(daniilidis(A, B), X)
-    assert turned < 1e-9
-    assert moved < 1e-9
 
 
 def test_jacobian_is_the_derivative():
@@ -94,9 +83,11 @@ def test_refined_beats_closed_forms_and_knows_its_error():
     ours, best, covered = [], [], []
     for seed in range(12):
         A, B, X = station(seed, 40, np.array([0.0003, 0.0003, 0.002]), 0.004)
-        start = refine_from_consensus(A, B)
+        start = refined_from_consensus(A, B)
         ours.append(apart(start.X, X))
-        best.append(np.min([apart(method(A, B), X) for method in (park_martin, daniilidis)], axis=0))
+        best.append(
+            np.min([apart(method(A, B), X) for method in (park_martin, lambda A, B: shah(A, B)[0])], axis=0)
+        )
         off = np.r_[start.X[:3, 3] - X[:3, 3], rotation_log(start.X[:3, :3] @ X[:3, :3].T)]
         covered.append(np.abs(off) <= np.sqrt(np.diag(start.covariance)[:6]))
     assert (np.median(ours, axis=0) < [1, 0.6] * np.median(best, axis=0)).all()
@@ -108,7 +99,7 @@ def test_leaving_one_out_is_solving_without_it():
     A, B, _ = station(2, 20)
     result = solve_hand_eye(A, B)
     rest = np.arange(20) != 7
-    without = refine_from_consensus(A[rest], B[rest])
+    without = refined_from_consensus(A[rest], B[rest])
     expected = residuals(A[7:8], B[7:8], without.X, without.Z)[0]
     assert np.abs(result.left_out[7] - expected).max() < 0.1 * np.abs(expected).max()
     assert result.leave_one_out[0] > np.sqrt(np.mean(np.sum(result.residual[:, :3] ** 2, axis=1)))
@@ -230,7 +221,7 @@ def test_damaged_poses_are_data_errors(spoil, says):
 @pytest.mark.skipif(not MOVEIT.exists(), reason="needs ../shared/realdata")
 def test_moveit_gives_the_published_answer():
     """MoveIt's real pairs give its published translation within 1 % and rotation within 1 %; eye-in-hand fails by name."""
-    hand, target = read_pairs(MOVEIT)
+    hand, target, _ = read_pairs(MOVEIT)
     result = solve_hand_eye(hand, target, eye_to_hand=True)
     rx, ry, rz = (rotation_exp(a * e) for a, e in zip((0.230, -2.540, 1.950), np.eye(3), strict=True))
     truth = transform(rx @ ry @ rz, [0.659, -0.249, 0.830])
@@ -245,9 +236,9 @@ def test_moveit_gives_the_published_answer():
 @pytest.mark.skipif(not ETH.exists(), reason="needs ../shared/realdata")
 def test_eth_streams_repeat():
     """A real arm's two halves of a stream agree within a centimetre and 0.3 degrees; its target poses are named inverted."""
-    hand = make_stream(*read_csv(next(ETH.glob("*hinge.csv"))), "hand")
-    seconds, poses = read_csv(next(ETH.glob("*target_ir.csv")))
-    A, B = pairs_at(hand, make_stream(seconds, invert_all(poses), "target"), -0.0157)
+    hand, seen = (read_poses(next(ETH.glob(name))) for name in ("*hinge.csv", "*target_ir.csv"))
+    target = make_stream(seen.seconds, invert_all(seen.usual), "target")
+    A, B, _ = stream_pairs(make_stream(hand.seconds, hand.usual, "hand"), target, -0.0157)
     one, two = (solve_hand_eye(A[s], B[s], blocks=10) for s in (slice(0, 100), slice(100, 200)))
     turned, moved = apart(one.X, two.X)
     assert moved < 0.01
@@ -259,24 +250,20 @@ def test_eth_streams_repeat():
 def test_time_offset_is_found(offset):
     """Clocks that differ by a few frames or by an epoch are brought together to two milliseconds."""
     hand, target, X = streams(offset)
-    start, correlation = coarse_offset(hand, target)
-    found, sigma = refine_offset(
-        hand, target, start, lambda A, B: -refine_from_consensus(A, B).log_likelihood
-    )
-    assert abs(start - offset) < 0.03
-    assert correlation > 0.8
-    assert abs(found - offset) < 0.002
-    assert sigma < 0.002
-    assert apart(solve_hand_eye(*pairs_at(hand, target, found), blocks=10).X, X)[1] < 0.002
+    A, B, found = stream_pairs(hand, target)
+    assert abs(found["time_offset_s"] - offset) < 0.002
+    assert found["time_offset_sigma_s"] < 0.002
+    assert found["correlation"] > 0.8
+    assert apart(solve_hand_eye(A, B, blocks=10).X, X)[1] < 0.002
 
 
 def test_time_offset_of_foreign_or_periodic_streams_is_refused():
-    """Streams of different motions, and motion that repeats itself, have no offset."""
+    """Streams of different motions, motion that repeats itself, and streams that never overlap have no offset."""
     hand, target, _ = streams(0.1, period=2.0)
     other = streams(0.1, seed=9)[1]
-    for second in (target, other):
+    for second, offset in ((target, None), (other, None), (target, 1e4)):
         with pytest.raises(HandEyeRefused) as caught:
-            coarse_offset(hand, second)
+            stream_pairs(hand, second, offset)
         assert caught.value.cause == Cause.TIME_OFFSET
 
 

@@ -1,102 +1,285 @@
-"""``calibrate hand-eye``: the files it reads, what it writes, and what it refuses."""
+"""``calibrate hand-eye``: recordings, streams and the files of other programs that it reads, what it writes, what it refuses."""
 
 from __future__ import annotations
 
-import argparse
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 
-from calibration.cli import calibrate as calibrate_cli
-from calibration.hand_eye.files import read_csv, read_pairs
+from calibration.hand_eye.files import read_pairs, read_poses, readings_of
+from tests.commands import calibrate
 from tests.hand_eye import apart, station, streams
-from tofcapture.errors import DataError, FormatError, UsageError
-from tofcapture.poses import invert
+from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects
+from tofcapture.devices.sim.world import SimWorld, read_constants
+from tofcapture.errors import DataError, FormatError, QualityError, UsageError
+from tofcapture.files.view import view_path, write_view
+from tofcapture.frames import ArmState, View
+from tofcapture.poses import exp, invert, look_at, rotation_exp
+
+HAND, TARGET, X = station(3, 15)
+SMALL = {
+    "stereo": {"width": 640, "height": 512, "fx": 577.5, "fy": 577.5, "cx": 319.5, "cy": 255.5},
+    "tof": {"width": 120, "height": 90, "fx": 95.3, "fy": 100.4, "cx": 57.9, "cy": 50.2},
+    "render": {"multipath": False, "subpixels": 1},
+}
 
 
-def args(*words):
-    parser = argparse.ArgumentParser()
-    calibrate_cli.COMMAND.configure(parser)
-    return parser.parse_args([str(w) for w in words])
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Eight views of the simulated board whose rig is 5 mm and 0.8 deg off, and the true rig."""
+    root, rng = tmp_path_factory.mktemp("recording"), np.random.default_rng(0)
+    world = SimWorld(read_constants(SMALL, "test"), 3, lambda name, _: scene_objects(name, 3))
+    world.place("calibration")
+    true, upright = world.true_rig, rotation_exp([0.0, BOARD_TILT, 0.0])
+    wrong = replace(true, T_flange_tof=true.T_flange_tof @ exp([0.004, -0.003, 0.002, 0.01, -0.008, 0.006]))
+    for i in range(8):
+        tilt, turn, away = np.radians(10 + 3 * i), 2.4 * i, 0.5 + 0.2 * (0.618 * i % 1)
+        way = upright @ [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)]
+        aim, roll = BOARD_CENTRE + rng.normal(0, 0.01, 3), rng.uniform(-0.5, 0.5)
+        T = look_at(BOARD_CENTRE + away * way, aim, up=[1.0, 0.0, 0.0], roll=roll) @ invert(true.T_flange_tof)
+        world.set_pose(T, str(i).encode())
+        arm = ArmState(np.zeros(6), T, 0)
+        view = View("calibration", i, world.tof(2, clock=int), world.stereo(clock=int), arm, arm, wrong)
+        write_view(view_path(root, "calibration", i), view)
+    return root, true
+
+
+def test_a_recording_gives_the_stereo_camera_on_the_flange(recorded):
+    """Without a target detector the place of the stereo camera comes back to a millimetre, five times nearer than it was believed."""
+    root, true = recorded
+    data = calibrate("hand-eye", root).data
+    turned, moved = apart(np.array(data["T_flange_camera"]), true.T_flange_stereo)
+    assert moved < 1e-3
+    assert np.degrees(turned) < 0.1
+    assert (data["camera"], data["mount"], data["pairs"]) == ("stereo", "eye-in-hand", 8)
+
+
+def test_a_recording_of_too_few_views_is_refused(recorded, tmp_path):
+    """Views that no rigid motion brings together are counted and named; an empty folder says what to record."""
+    root, _ = recorded
+    for i in range(2):
+        path = view_path(tmp_path, "calibration", i)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.symlink_to(view_path(root, "calibration", i))
+    with pytest.raises(QualityError, match="at least 3 views"):
+        calibrate("hand-eye", tmp_path)
+    with pytest.raises(DataError, match="calibration views") as caught:
+        calibrate("hand-eye", tmp_path / "views")
+    assert "record --calibration" in caught.value.hint
+
+
+def rows(poses, order="xyzw", scale=1.0):
+    """(N, 7) translation and quaternion."""
+    q = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    return np.c_[scale * poses[:, :3, 3], q if order == "xyzw" else np.roll(q, 1, axis=1)]
+
+
+def text(table, header="", separator=","):
+    """Lines of numbers."""
+    return header + "".join(separator.join(f"{x:.9g}" for x in row) + "\n" for row in table)
+
+
+def ros(pose):
+    """A transform as ROS messages print it."""
+    x, y, z, qx, qy, qz, qw = rows(pose[None])[0].tolist()
+    return {"translation": {"x": x, "y": y, "z": z}, "rotation": {"x": qx, "y": qy, "z": qz, "w": qw}}
+
+
+def pairs(one, two):
+    return list(zip(one, two, strict=True))
+
+
+def moveit(a, b):
+    return {"effector_wrt_world": a.ravel().tolist(), "object_wrt_sensor": b.ravel().tolist()}
+
+
+MATRICES = json.dumps(pairs(HAND.tolist(), TARGET.tolist()))
+PAIRS = {
+    "matrices.json": lambda p: p.write_text(MATRICES),
+    "moveit.yaml": lambda p: p.write_text(yaml.safe_dump([moveit(*ab) for ab in pairs(HAND, TARGET)])),
+    "lists.json": lambda p: p.write_text(
+        json.dumps({"hand": HAND.tolist(), "target": rows(TARGET).tolist()})
+    ),
+    "ros.json": lambda p: p.write_text(
+        json.dumps({"samples": [{"robot": ros(a), "optical": ros(b)} for a, b in pairs(HAND, TARGET)]})
+    ),
+    "pairs.npz": lambda p: np.savez(p, T_gripper2base=HAND, T_target2cam=TARGET),
+    "fourteen.csv": lambda p: p.write_text(
+        text(np.c_[rows(HAND), rows(TARGET)], "ax,ay,az,a,b,c,d,bx,by,bz,e,f,g,h\n")
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_files_of_pairs_give_the_pairs(tmp_path, name):
+    """Every form of pairs gives the poses that were written, and nothing had to be decided."""
+    PAIRS[name](tmp_path / name)
+    hand, target, said = read_pairs(tmp_path / name)
+    np.testing.assert_allclose(hand, HAND, atol=1e-6)
+    np.testing.assert_allclose(target, TARGET, atol=1e-6)
+    assert said == {}
+
+
+@pytest.mark.parametrize(("hand", "target"), [("wxyz", "xyzw"), ("xyzw", "wxyz"), ("wxyz", "wxyz")])
+def test_the_order_of_quaternions_is_found(tmp_path, hand, target):
+    """Scalar first or last is told by which of them moves rigidly with the other side."""
+    path = tmp_path / "pairs.json"
+    path.write_text(json.dumps(pairs(rows(HAND, hand).tolist(), rows(TARGET, target).tolist())))
+    A, B, said = read_pairs(path)
+    np.testing.assert_allclose(A, HAND, atol=1e-6)
+    np.testing.assert_allclose(B, TARGET, atol=1e-6)
+    given = {"hand": hand, "target": target}
+    assert said == {who: "quaternions wxyz" for who, order in given.items() if order == "wxyz"}
+
+
+STREAMS = {
+    "tum": lambda t, T: text(np.c_[t, rows(T)], "# timestamp tx ty tz qx qy qz qw\n", " "),
+    "header wxyz": lambda t, T: text(np.c_[t, rows(T, "wxyz")], "time,x,y,z,qw,qx,qy,qz\n"),
+    "millimetres": lambda t, T: text(np.c_[t, rows(T, scale=1e3)], ""),
+    "rotation vector": lambda t, T: text(
+        np.c_[T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_rotvec(), t], "x;y;z;rx;ry;rz;t\n", ";"
+    ),
+    "degrees": lambda t, T: text(
+        np.c_[t, T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz", degrees=True)],
+        "t, x [m], y [m], z [m], roll (deg), pitch (deg), yaw (deg)\n",
+    ),
+    "matrix": lambda t, T: text(np.c_[t, T[:, :3].reshape(-1, 12)]),
+    "json": lambda t, T: json.dumps({"seconds": t.tolist(), "poses": rows(T).tolist()}),
+}
+
+
+@pytest.mark.parametrize("form", STREAMS)
+def test_tables_of_poses_are_read(tmp_path, form):
+    """Headers in any order, TUM, millimetres, rotation vectors, roll pitch yaw in degrees and 3x4 matrices are the same poses."""
+    path = tmp_path / ("poses.json" if form == "json" else "poses.txt")
+    path.write_text(STREAMS[form](np.arange(len(HAND)) * 0.1, HAND))
+    found = read_poses(path)
+    np.testing.assert_allclose(found.usual, HAND, atol=1e-6)
+    np.testing.assert_allclose(found.seconds, np.arange(len(HAND)) * 0.1)
+    assert found.millimetres == (form == "millimetres")
 
 
 def test_command_reads_pairs_and_writes_json(tmp_path):
-    """calibrate hand-eye takes JSON pairs and CSV pairs alike, prints a table and writes the same numbers."""
-    from scipy.spatial.transform import Rotation
-
-    A, B, X = station(7)
-    (tmp_path / "pairs.json").write_text(
-        json.dumps([[a.tolist(), b.tolist()] for a, b in zip(A, B, strict=True)])
-    )
-    for name, T in (("hand.csv", A), ("target.csv", B)):
-        rows = np.c_[np.arange(len(T)), T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()]
-        np.savetxt(
-            tmp_path / name, rows, delimiter=",", header="t,x,y,z,qx,qy,qz,qw", fmt="%.12f", comments=""
-        )
+    """Pairs in JSON and two files with the same times give one answer; the table and the file hold the same numbers."""
+    (tmp_path / "pairs.json").write_text(MATRICES)
+    for name, T in (("hand.csv", HAND), ("target.csv", TARGET)):
+        (tmp_path / name).write_text(text(np.c_[np.arange(len(T)), rows(T)], "t,x,y,z,qx,qy,qz,qw\n"))
     out = tmp_path / "result.json"
-    one = calibrate_cli.COMMAND.run(args("hand-eye", tmp_path / "pairs.json", "--out", out))
-    two = calibrate_cli.COMMAND.run(args("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv"))
+    one = calibrate("hand-eye", tmp_path / "pairs.json", "--out", out)
+    two = calibrate("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv")
     written = json.loads(out.read_text())
-    np.testing.assert_allclose(written["T_flange_camera"], two.data["T_flange_camera"], atol=1e-8)
+    np.testing.assert_allclose(written["T_flange_camera"], two.data["T_flange_camera"], atol=1e-6)
     assert apart(np.array(written["T_flange_camera"]), X)[1] < 0.002
-    assert "standard error" in one.text
+    assert f"{1e3 * written['T_flange_camera'][0][3]:.2f}" in one.text
+    error = written["standard_error"]
+    line = next(line for line in one.text.splitlines() if "standard error" in line)
+    assert line.split()[-2:] == [f"{error['translation_mm']:.3f}", f"{error['rotation_deg']:.4f}"]
     assert written["leave_one_out"] is not None
     inverted = tmp_path / "inverted.json"
-    inverted.write_text(json.dumps([[a.tolist(), invert(b).tolist()] for a, b in zip(A, B, strict=True)]))
-    same = calibrate_cli.COMMAND.run(args("hand-eye", inverted, "--inverted-target"))
+    inverted.write_text(json.dumps([[a.tolist(), invert(b).tolist()] for a, b in pairs(HAND, TARGET)]))
+    same = calibrate("hand-eye", inverted, "--inverted-target")
     np.testing.assert_allclose(same.data["T_flange_camera"], written["T_flange_camera"], atol=1e-6)
+
+
+def test_command_solves_two_files_without_times(tmp_path):
+    """Two files pose by pose, one with wxyz in millimetres, give X; the table says how they were read."""
+    (tmp_path / "hand.csv").write_text(text(rows(HAND, "wxyz", 1e3)))
+    (tmp_path / "target.csv").write_text(text(rows(TARGET)))
+    outcome = calibrate("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv")
+    assert np.abs(np.array(outcome.data["T_flange_camera"]) - X).max() < 0.005
+    assert outcome.data["read_as"] == {"hand": "quaternions wxyz, millimetres"}
+    assert "millimetres" in outcome.text
 
 
 def test_command_finds_the_offset_of_streams(tmp_path):
     """Two CSV streams with clocks apart are brought together and solved in one call."""
-    from scipy.spatial.transform import Rotation
-
-    hand, target, X = streams(0.25)
+    hand, target, truth = streams(0.25)
     for name, stream in (("hand.csv", hand), ("target.csv", target)):
-        T = stream.poses
-        np.savetxt(
-            tmp_path / name,
-            np.c_[stream.seconds, T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()],
-            fmt="%.9f",
-        )
-    data = calibrate_cli.COMMAND.run(args("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv")).data
+        np.savetxt(tmp_path / name, np.c_[stream.seconds, rows(stream.poses)], fmt="%.9f")
+    data = calibrate("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv").data
     assert abs(data["time_offset_s"] - 0.25) < 0.002
-    assert apart(np.array(data["T_flange_camera"]), X)[1] < 0.002
+    assert apart(np.array(data["T_flange_camera"]), truth)[1] < 0.002
 
 
 @pytest.mark.parametrize(
-    ("text", "kind"),
+    ("name", "content", "kind", "says"),
     [
-        ("", FormatError),
-        ("[]", DataError),
-        ("{}", FormatError),
-        ("[[1, 2]]", FormatError),
-        ("[[[[1]], [[2]]]]", FormatError),
+        ("pairs.json", "", FormatError, "JSON"),
+        ("pairs.json", "[]", DataError, "empty list"),
+        ("pairs.json", "{}", FormatError, "names such as"),
+        ("pairs.json", "3", FormatError, "a list of pairs"),
+        ("pairs.json", "[[1, 2]]", FormatError, "got 1"),
+        ("pairs.json", "[[[[1]], [[2]]]]", FormatError, "got 1"),
+        ("pairs.json", '[{"hand": [1]}]', FormatError, "pair 0"),
+        ("pairs.json", '{"hand": [1, 2], "target": [1]}', DataError, "as many"),
+        ("pairs.yaml", "a: [", FormatError, "YAML"),
+        ("pairs.npz", "no arrays", FormatError, "arrays"),
+        ("pairs.npz", "PK\x03\x04 cut", FormatError, "arrays"),
+        ("pairs.csv", "\udcff\udcfe", FormatError, "text"),
+        ("pairs.csv", "1,2,3,0,0,0,1\n", FormatError, "two poses"),
+        ("folder.csv", None, FormatError, "text"),
     ],
 )
-def test_bad_pair_files_are_named(tmp_path, text, kind):
-    """Files that hold no pairs say so with their path."""
-    path = tmp_path / "pairs.json"
-    path.write_text(text)
-    with pytest.raises(kind, match=r"pairs\.json"):
+def test_bad_pair_files_are_named(tmp_path, name, content, kind, says):
+    """Files that hold no pairs say what was expected, with their path."""
+    path = tmp_path / name
+    path.mkdir() if content is None else path.write_bytes(content.encode("utf-8", "surrogateescape"))
+    with pytest.raises(kind, match=name.replace(".", r"\.")) as caught:
         read_pairs(path)
+    assert says in str(caught.value)
     with pytest.raises(DataError, match="no such file"):
-        read_pairs(tmp_path / "none.json")
+        read_pairs(tmp_path / f"none-{name}")
 
 
 @pytest.mark.parametrize(
-    "text", ["", "t,x\n", "0,1,2,3,0,0,0,1\n0,1,2\n", "0,1,2,3,1,1,0,1\n", "0,nan,2,3,0,0,0,1\n"]
+    ("content", "says"),
+    [
+        ("", "one a line"),
+        ("t,x\n", "one a line"),
+        ("0,1,2,3,0,0,0,1\n0,1,2\n", ":2: expected 8 numbers"),
+        ("0,1,2,3,1,1,0,1\n", "unit quaternions"),
+        ("0,nan,2,3,0,0,0,1\n", "finite"),
+        ("x,y,z,a\n1,2,3,4\n", "no rotation"),
+        ("x,y,z,roll,pitch,yaw\n1,2,3,0,inf,0\n", "finite"),
+    ],
 )
-def test_bad_csv_files_are_named(tmp_path, text):
-    """Streams with missing columns, NaN or quaternions that are none say so with their path."""
+def test_bad_tables_are_named(tmp_path, content, says):
+    """Streams with missing columns, NaN or quaternions that are none say so with their path, and the line where there is one."""
     path = tmp_path / "hand.csv"
-    path.write_text(text)
-    with pytest.raises(DataError, match=r"hand\.csv"):
-        read_csv(path)
+    path.write_text(content)
+    with pytest.raises(DataError, match=r"hand\.csv") as caught:
+        read_poses(path)
+    assert says in str(caught.value)
 
 
-def test_command_refuses_three_files():
-    """More than two files are a usage error."""
+@pytest.mark.parametrize(
+    ("values", "kind", "says"),
+    [
+        ([], DataError, "none"),
+        ([[0.0] * 6] * 4, FormatError, "rotation vectors"),
+        ([[0.0] * 7, [0.0] * 16], FormatError, "one form"),
+        ([[0, 0, 0, 1, 1, 0, 0]], DataError, "unit quaternions"),
+        ([{"translation": [0, 0, 0]}], FormatError, "rotation"),
+        ([{"translation": {"x": 1}, "rotation": [0, 0, 0, 1]}], FormatError, "x, y, z"),
+        ([["a"]], FormatError, "numbers"),
+    ],
+)
+def test_what_no_pose_is_has_a_name(values, kind, says):
+    """Empty lists, Euler angles without a header, mixed forms, wrong quaternions, half a pose and words are named."""
+    with pytest.raises(kind) as caught:
+        readings_of(values, "file")
+    assert says in f"{caught.value} {caught.value.hint}"
+
+
+def test_command_refuses_what_makes_no_pairs(tmp_path):
+    """More than two files are a usage error; two lists of different length need times."""
     with pytest.raises(UsageError):
-        calibrate_cli.COMMAND.run(args("hand-eye", "a.csv", "b.csv", "c.csv"))
+        calibrate("hand-eye", "a.csv", "b.csv", "c.csv")
+    (tmp_path / "a.csv").write_text(text(rows(HAND)))
+    (tmp_path / "b.csv").write_text(text(rows(TARGET[1:])))
+    with pytest.raises(DataError, match="times before them, got 15 and 14"):
+        calibrate("hand-eye", tmp_path / "a.csv", tmp_path / "b.csv")

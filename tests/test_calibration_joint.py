@@ -16,7 +16,7 @@ from calibration.alignment.methods import (
     unconstrained,
 )
 from calibration.alignment.views import HALO_RADII, TERMS, JointView, halo_errors
-from calibration.range_error.error import jackknife
+from calibration.range_error.terms import jackknife
 from calibration.registration.clouds import Cloud
 from calibration.registration.rims import Rims, lit_rims, square_rims
 from tofcapture import poses

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from calibration.board.fit import Model, clear_of_walls
 from calibration.board.geometry import load_board
-from calibration.cli import lens as lens_cli
-from calibration.cli.lens import report, table
-from calibration.lens.board import BoardSeen, fit_lens_to_board
+from calibration.cli.sensor import lens_report, lens_table
+from calibration.lens.fit import BoardSeen, fit_lens, fit_lens_to_board
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.devices.station import DEFAULT
-from tofcapture.errors import DataError, QualityError
+from tofcapture.errors import DataError
 from tofcapture.files.view import read_view
 from tofcapture.poses import invert, look_at
 from tofcapture.rig import Rig, dumps_rig, load_rig
@@ -54,7 +52,7 @@ def seen(camera, count=14, noise=0.15, growth=0.2, seed=0):
         pixels += rng.normal(0, noise, pixels.shape)
         good = clear & (pixels > 3).all(axis=1) & (pixels < [236, 176]).all(axis=1)
         off = poses.exp(np.r_[rng.normal(0, 0.003, 3), rng.normal(0, 0.01, 3)])
-        out.append(BoardSeen(f"view-{i:03d}", pixels[good][:: max(1, good.sum() // 300)], off @ T))
+        out.append(BoardSeen(pixels[good][:: max(1, good.sum() // 300)], off @ T))
     return out
 
 
@@ -71,8 +69,10 @@ def test_the_lens_that_made_the_rims_comes_out():
     assert farthest(fit.camera, TRUE) < 0.6
     assert abs(fit.camera.fx - TRUE.fx) < 4 * fit.sigma[0] + 0.05
     assert fit.rms < 0.3
-    data = report(fit, Rig(GUESS, Camera(1280, 1024, 1155.0, 1155.0, 639.5, 511.5), np.eye(4), np.eye(4)))
-    assert "fx" in table({**data, "refused": []})
+    data = lens_report(
+        fit, Rig(GUESS, Camera(1280, 1024, 1155.0, 1155.0, 639.5, 511.5), np.eye(4), np.eye(4))
+    )
+    assert "fx" in lens_table({**data, "refused": []})
 
 
 def test_a_pinhole_stays_one():
@@ -89,29 +89,30 @@ def test_too_few_views_are_refused():
         fit_lens_to_board(MODEL, seen(TRUE, 3), GUESS)
 
 
-def test_views_that_a_wrong_lens_hid_are_looked_at_again(tmp_path, monkeypatch, capsys):
+def test_views_that_a_wrong_lens_hid_are_looked_at_again():
     """With the believed pinhole three boards look like another one; with the lens of the others they are found, and used."""
-    stereo = Camera(1280, 1024, 1155.0, 1155.0, 639.5, 511.5)
-    (tmp_path / "rig.toml").write_text(dumps_rig(Rig(GUESS, stereo, np.eye(4), np.eye(4))))
-    views = {v.name: v for v in seen(TRUE)}
-    hidden = ["view-003", "view-007", "view-012"]
+    views = seen(TRUE)
 
-    def look(view, rig, board, name):
-        if name == "view-001" or (name in hidden and not rig.tof.distortion):
-            raise QualityError("board: wrong board")
-        return views[name]
+    def look(camera):
+        lost = {1} if camera.distortion else {1, 3, 7, 12}
+        return [v for i, v in enumerate(views) if i not in lost], [f"view-{i:03d} wrong board" for i in lost]
 
-    monkeypatch.setattr(
-        "calibration.registration.pairs.calibration_views", lambda _: [Path(name) for name in views]
-    )
-    monkeypatch.setattr("tofcapture.files.view.read_view", lambda path: path)
-    monkeypatch.setattr(lens_cli, "board_seen", look)
-    assert main(["calibrate", "lens", str(tmp_path), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    told = told.get("data", told)
-    assert told["views"] == len(views) - 1
-    assert [r.split()[0] for r in told["refused"]] == ["view-001"]
-    assert farthest(load_rig(tmp_path / "rig.toml").tof, TRUE) < 0.6
+    fit, refused = fit_lens(MODEL, look, GUESS)
+    assert len(fit.left_out) == len(views) - 1
+    assert refused == ["view-001 wrong board"]
+    assert farthest(fit.camera, TRUE) < 0.6
+
+
+def test_a_wrong_board_in_the_second_look_does_not_count():
+    """Boards found in addition that do not fit the lens as well leave the first look's lens and its refusals."""
+    views = seen(TRUE)
+
+    def look(camera):
+        return (seen(TRUE, noise=0.6), []) if camera.distortion else (views[1:], ["view-000 wrong board"])
+
+    fit, refused = fit_lens(MODEL, look, GUESS)
+    assert len(fit.left_out) == len(views) - 1
+    assert refused == ["view-000 wrong board"]
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 
 import numpy as np
@@ -10,10 +9,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from calibration.cli import calibrate as calibrate_cli
 from calibration.phase_order.find import PhaseOrderRefused, find_phase_order
+from tests.commands import calibrate
 from tofcapture.camera import Camera
-from tofcapture.errors import DataError, FormatError
+from tofcapture.errors import DataError, FormatError, UsageError
 from tofcapture.ops.phase import mean_phasors, taps
 from tofcapture.rig import SPEED_OF_LIGHT
 
@@ -137,27 +136,28 @@ def test_wrong_shapes_are_data_errors(shape):
         find_phase_order(np.zeros(shape), (20e6, 100e6) if shape[1] != 12 else (1e6, 2e6, 3e6))
 
 
-def args(*words):
-    parser = argparse.ArgumentParser()
-    calibrate_cli.COMMAND.configure(parser)
-    return parser.parse_args([str(w) for w in words])
-
-
 def test_command_finds_and_writes(tmp_path):
-    """calibrate phase-order reads .npy, prints one line per channel and writes JSON; damaged files are named."""
+    """calibrate phase-order reads .npy, prints one line per channel and writes JSON; damaged files and words are named."""
     raw, radial, hz, theta = made(5, (20e6, 100e6))
     np.save(tmp_path / "raw.npy", raw)
     np.save(tmp_path / "radial.npy", radial)
-    out = tmp_path / "order.json"
-    outcome = calibrate_cli.COMMAND.run(
-        args("phase-order", tmp_path / "raw.npy", "--reference", tmp_path / "radial.npy", "--out", out)
-    )
+    reference, out = ("--reference", tmp_path / "radial.npy"), tmp_path / "order.json"
+    outcome = calibrate("phase-order", tmp_path / "raw.npy", *reference, "--out", out)
     written = json.loads(out.read_text())
     assert written["modulation_hz"] == hz.tolist()
     np.testing.assert_allclose(written["phase_rad"], theta)
-    assert len(outcome.text.splitlines()) >= 10
+    for k, line in enumerate(outcome.text.splitlines()[1:9]):
+        assert [float(x) for x in line.split()] == [k, hz[k] / 1e6, round(np.degrees(theta[k]))]
+    alone = calibrate("phase-order", tmp_path / "raw.npy")
+    assert alone.data["offset_rad"] == [None, None]
     (tmp_path / "bad.npy").write_text("no array")
-    with pytest.raises(FormatError):
-        calibrate_cli.COMMAND.run(args("phase-order", tmp_path / "bad.npy"))
-    with pytest.raises(DataError, match="no such file"):
-        calibrate_cli.COMMAND.run(args("phase-order", tmp_path / "none.npy"))
+    for words, kind, says in (
+        (("bad.npy",), FormatError, "npy"),
+        (("none.npy",), DataError, "no such file"),
+        (("raw.npy", "--reference", tmp_path / "none.npy"), DataError, "no such file"),
+        (("raw.npy", "--reference", tmp_path / "bad.npy"), FormatError, "npy"),
+        (("raw.npy", "--mhz", "fast"), UsageError, "--mhz"),
+        (("raw.npy", "--shape", "180"), UsageError, "--shape"),
+    ):
+        with pytest.raises(kind, match=says):
+            calibrate("phase-order", tmp_path / words[0], *words[1:])

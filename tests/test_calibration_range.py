@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from calibration.cli import calibrate as calibrate_cli
 from calibration.range_error.fit import fit_ranges
-from calibration.range_error.surface import surface_at_pixels
-from calibration.range_error.views import seen_of
+from calibration.range_error.views import seen_of, surface_at_pixels
+from tests.commands import calibrate
 from tests.decoding import decode
 from tofcapture import poses
 from tofcapture.camera import Camera
@@ -90,11 +88,12 @@ def left(found, true):
 
 
 def test_the_surface_is_right_to_a_hundredth_of_a_millimetre():
-    """A noise-free plane seen by the stereo camera gives its own depth at every ToF pixel that is good."""
+    """A plane seen by the stereo camera with little noise gives its own depth at every ToF pixel that is good."""
     normal, centre = np.array([0.3, 0.2, -0.93]) / np.linalg.norm([0.3, 0.2, -0.93]), np.array([0, 0, 0.7])
     z = plane_depth(STEREO, poses.invert(T_TOF_STEREO), normal, centre)
-    points = poses.transform_points(T_TOF_STEREO, STEREO.unproject(z).reshape(-1, 3))
-    planes, good = surface_at_pixels(points, CAMERA)
+    z = z + np.random.default_rng(0).normal(0, 2e-5, z.shape)
+    seen = replace(made(0, np.random.default_rng(0)), depth=z)
+    planes, good = surface_at_pixels(seen, T_TOF_STEREO)
     assert good.mean() > 0.5
     depth = 1 / (planes * CAMERA.rays).sum(axis=-1)
     assert np.abs(depth - plane_depth(CAMERA, np.eye(4), normal, centre))[good].max() < 1e-5
@@ -109,7 +108,7 @@ def test_offset_waves_and_image_terms_come_out(guess):
     fit = fit_ranges(seen, T, np.r_[[3e-4] * 3, [5e-4] * 3])
     assert (left(fit.errors, ERRORS) < 1e-3).all(), left(fit.errors, ERRORS)
     assert left(fit.errors, ERRORS)[1] < 8e-4
-    assert not any(t.warmth or t.darkness for t in fit.terms)
+    assert not any({"temperature", "darkness"} & set(t.names) for t in fit.terms)
 
 
 def test_light_thrown_back_shows_as_spread_of_the_views():
@@ -129,7 +128,7 @@ def test_temperature_and_darkness_are_fitted_when_they_vary():
     celsius = 45 + 6 * np.sin(np.arange(VIEWS) * 1.7)
     seen = [made(i, rng, sensor=sensor, grey=True, celsius=c) for i, c in enumerate(celsius)]
     fit = fit_ranges(seen, T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
-    assert all(t.warmth and t.darkness for t in fit.terms)
+    assert all({"temperature", "darkness"} < set(t.names) for t in fit.terms)
     assert fit.errors[1].per_kelvin == pytest.approx(-3e-4, abs=5e-5)
     assert fit.errors[1].per_inverse_amplitude == pytest.approx(0.15, abs=0.05)
     assert (left(fit.errors, errors) < 1e-3).all()
@@ -141,7 +140,7 @@ def test_fitted_errors_correct_a_burst():
     fit = fit_ranges([made(i, rng) for i in range(VIEWS)], T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
     away = made(40, rng, sensor=replace(SENSOR, read_noise=0.0, shot_noise=False, quantise=False), away=0.83)
     decoded = decode(away.phasor, INFO.modulation_hz, CAMERA, INFO.illuminator, fit.errors, 45.0)
-    planes, good = surface_at_pixels(poses.transform_points(T_TOF_STEREO, away.points), CAMERA)
+    planes, good = surface_at_pixels(away, T_TOF_STEREO)
     off = decoded.radial - CAMERA.ray_lengths / (planes * CAMERA.rays).sum(axis=-1)
     assert np.sqrt(np.mean(np.square(off[good]))) < 1e-3
     errors = tuple(replace(e, per_inverse_amplitude=0.1) for e in fit.errors)
@@ -167,17 +166,81 @@ def test_too_few_views_and_a_wrong_frequency_are_refused():
         )
 
 
-def test_command_writes_rig_and_report(tmp_path):
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Eight views from 0.3 to 1.4 m."""
+    root, rng = tmp_path_factory.mktemp("range"), np.random.default_rng(5)
+    for i, k in enumerate(range(0, 16, 2)):
+        write_view(view_path(root, "calibration", i), made_view(k, rng))
+    return root
+
+
+def test_command_writes_rig_and_report(recording):
     """calibrate range fits a recording, writes rig.toml and range.json, and says what it could not know."""
-    rng = np.random.default_rng(5)
-    for i in range(8):
-        write_view(view_path(tmp_path, "calibration", i), made_view(2 * i, rng))
-    parser = argparse.ArgumentParser()
-    calibrate_cli.COMMAND.configure(parser)
-    outcome = calibrate_cli.COMMAND.run(parser.parse_args(["range", str(tmp_path)]))
-    assert load_rig(tmp_path / "rig.toml").range_errors[1].modulation_hz == 100e6
-    assert json.loads((tmp_path / "range.json").read_text())["transform"] == "nothing"
-    assert "align" in outcome.text
-    assert "temperature varied" in outcome.text
+    dry = calibrate("range", recording, "--dry-run")
+    assert not (recording / "rig.toml").exists()
+    outcome = calibrate("range", recording)
+    found = load_rig(recording / "rig.toml")
+    assert (left(found.range_errors, ERRORS) < 2e-3).all()
+    written = json.loads((recording / "range.json").read_text())
+    assert written["transform"] == "nothing"
+    assert written == dry.data == {k: v for k, v in outcome.data.items() if k != "rig"}
+    for word in ("align", "temperature varied by 0.0 K", "no term of dark"):
+        assert word in outcome.text
     with pytest.raises(UsageError, match="harmonics"):
-        calibrate_cli.COMMAND.run(parser.parse_args(["range", str(tmp_path), "--orders", "0"]))
+        calibrate("range", recording, "--orders", "0")
+    with pytest.raises(UsageError, match="whole numbers"):
+        calibrate("range", recording, "--orders", "two")
+
+
+def test_the_report_s_numbers_are_those_of_the_sensor(recording):
+    """What the report says in millimetres is the error that was put in before the fit, and what it lacks of it afterwards."""
+    data = calibrate("range", recording, "--dry-run").data
+    near, far = data["covered_m"]
+    assert 0.25 < near < 0.32
+    assert 1.3 < far < 2.1
+    for row, error in zip(data["frequencies"], ERRORS, strict=True):
+        assert row["found"]["offset"]["value"] == pytest.approx(
+            0.017, abs=3 * row["found"]["offset"]["sigma"]
+        )
+        assert row["found"]["radius"]["value"] == pytest.approx(1.5e-4, abs=4e-5)
+        for line in row["by_range"]:
+            r = np.linspace(line["from_m"], line["from_m"] + 0.1, 21)[:, None, None]
+            turned = 4 * np.pi * error.modulation_hz / SPEED_OF_LIGHT * r
+            put_in = error.at(turned, phase.radius_px(CAMERA), 45.0, image_places(CAMERA))
+            assert 1e3 * put_in.min() - 2 < line["before_mm"] < 1e3 * put_in.max() + 2
+            assert abs(line["left_out_mm"]) < 4
+            assert line["pixels"] > 100
+        assert {round(10 * line["from_m"]) for line in row["by_range"]} >= {3, 7, 9, 11, 13}
+        assert 10 < row["before_mm"] < 30
+        assert row["after_mm"] < 1
+        assert row["after_mm"] <= row["left_out_mm"] < 2
+        assert row["views_differ_mm"] < 1
+        assert row["verdict"] == ("PASS" if row["left_out_mm"] <= 1 else "WARN")
+    moved = data["transform_moved"]
+    assert np.abs(moved["translation_mm"]).max() < 5
+    assert np.abs(moved["rotation_deg"]).max() < 0.3
+
+
+def test_what_the_alignment_vouches_for_holds_the_transform(recording, tmp_path):
+    """Evidence of the very rig narrows the transform's prior, of the averaged method less; of another rig it counts for nothing."""
+    copied = tmp_path / "recording"
+    (copied / "views").mkdir(parents=True)
+    (copied / "views" / "calibration").symlink_to(recording / "views" / "calibration")
+    rig = Rig(CAMERA, STEREO, T_TOF_STEREO, np.eye(4), INFO.illuminator)
+    (copied / "rig.toml").write_text(dumps_rig(rig))
+    error = {"translation_mm": 0.001, "rotation_deg": 0.0001}
+    evidence = {
+        "T_tof_stereo": T_TOF_STEREO.tolist(), "working_point_m": [0, 0, 0.8], "standard_error": error,
+    }  # fmt: skip
+    stated = {"translation_mm": [0.001] * 3, "rotation_deg": [0.0001] * 3}
+    other = (poses.exp([0.01, 0, 0, 0, 0, 0]) @ T_TOF_STEREO).tolist()
+    for extra, known, most in (
+        ({"sigma": stated}, "aligned", 0.001),
+        ({}, "averaged", 0.003),
+        ({"T_tof_stereo": other}, "nothing", np.inf),
+    ):
+        (copied / "evidence.json").write_text(json.dumps(evidence | extra))
+        data = calibrate("range", copied, "--dry-run").data
+        assert data["transform"] == known
+        assert np.abs(data["transform_moved"]["translation_mm"]).max() < 3 * most

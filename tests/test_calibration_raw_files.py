@@ -79,22 +79,53 @@ def test_an_image_without_metadata_is_whole():
     assert without_metadata(raw).shape == raw.shape
 
 
-def test_what_is_no_raw_has_a_name(tmp_path):
-    """Missing files, words, other counts of images, two arrays, and binary files without a size each say so."""
+def broken(tmp_path):
+    """Files that hold no raw frames: what is written, the error, and what it says."""
     raw, *_ = frames()
-    with pytest.raises(DataError, match="no such file"):
-        read_raw(tmp_path / "none.npy", 8)
+    grey = raw[0, 0].astype(np.uint8)
+    cv2 = pytest.importorskip("cv2")
+    h5py = pytest.importorskip("h5py")
+
+    def folder(name, *images):
+        (tmp_path / name).mkdir()
+        for i, image in enumerate(images):
+            cv2.imwrite(str(tmp_path / name / f"{i}.png"), image)
+        return name
+
     np.save(tmp_path / "seven.npy", raw[0, :7])
-    with pytest.raises(DataError, match="multiple of 8"):
-        read_raw(tmp_path / "seven.npy", 8)
+    np.save(tmp_path / "words.npy", np.full((8, 4, 4), "a"))
+    np.save(tmp_path / "pickled.npy", np.array([{}]), allow_pickle=True)
     np.savez(tmp_path / "two.npz", a=raw, b=raw)
-    with pytest.raises(FormatError, match="one array"):
-        read_raw(tmp_path / "two.npz", 8)
+    with h5py.File(tmp_path / "flat.h5", "w") as file:
+        file["raw"] = np.zeros((5, 5))
+    (tmp_path / "cut.h5").write_bytes((tmp_path / "flat.h5").read_bytes()[:100])
     (tmp_path / "words.raw").write_bytes(b"\0" * 1000)
-    with pytest.raises(FormatError, match="size"):
-        read_raw(tmp_path / "words.raw", 8)
+    (tmp_path / "page.pdf").write_bytes(b"%PDF")
+    dead = folder("dead")
+    (tmp_path / dead / "0.png").write_bytes(b"no image")
+    colours = np.stack([grey, grey, 255 - grey], axis=-1)
+    return {
+        "none.npy": (DataError, "no such file"),
+        "seven.npy": (DataError, "multiple of 8"),
+        "words.npy": (FormatError, "numbers"),
+        "pickled.npy": (FormatError, "npy"),
+        "two.npz": (FormatError, "one array"),
+        "flat.h5": (FormatError, "none"),
+        "cut.h5": (FormatError, "HDF5"),
+        "words.raw": (FormatError, "size"),
+        "page.pdf": (FormatError, r"\.pdf"),
+        folder("empty"): (DataError, "images"),
+        dead: (FormatError, "an image"),
+        folder("colour", *[colours] * 8): (FormatError, "colours"),
+        folder("sizes", *[grey] * 7, grey[:-1]): (FormatError, "one size"),
+    }
+
+
+def test_what_is_no_raw_has_a_name(tmp_path):
+    """Missing and damaged files, words, other counts of images, two arrays, colours and files without a size each say so."""
+    for name, (kind, says) in broken(tmp_path).items():
+        with pytest.raises(kind, match=says) as caught:
+            read_raw(tmp_path / name, 8)
+        assert name in str(caught.value)
     with pytest.raises(FormatError, match="multiple"):
         read_raw(tmp_path / "words.raw", 8, SHAPE)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="images"):
-        read_raw(tmp_path / "empty", 8)

@@ -45,9 +45,8 @@ class Average:
     @property
     def spread(self) -> tuple[float, float]:
         """Standard deviation of one registration: rotation in radians, translation at the working point in metres."""
-        freedom = max(int(self.kept.sum()) - 1, 1)
         turned, moved = self.rotation_from_mean[self.kept], self.translation_from_mean[self.kept]
-        return float(np.sqrt(turned @ turned / freedom)), float(np.sqrt(moved @ moved / freedom))
+        return _deviation(turned), _deviation(moved)
 
     @property
     def standard_error(self) -> tuple[float, float]:
@@ -164,6 +163,10 @@ def _distances(R: Float64, images: Float64, rotation: Float64, image: Float64) -
 
 def _limit(distance: Float64, floor: float) -> float:
     return max(floor, OUTLIER * float(np.median(distance)))
+
+
+def _deviation(distance: Float64) -> float:
+    return float(np.sqrt(np.square(distance).sum() / max(len(distance) - 1, 1)))
 
 
 def _right_jacobian_inverse(e: Float64) -> Float64:

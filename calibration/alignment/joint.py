@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.alignment.views import HALO_RADII, TERMS, JointView
-from calibration.range_error.error import jackknife
+from calibration.range_error.terms import jackknife
 from calibration.registration.gate import tukey_weights
 from tofcapture.errors import QualityError
 from tofcapture.poses import Float64, exp, invert, transform, transform_points
@@ -50,11 +50,12 @@ class JointSolution:
     """What V views say together."""
 
     T_tof_stereo: Float64  #: (4, 4)
-    #: Range errors of :meth:`JointView.terms` at the solved transform, without scattered light: what ``rig.toml`` can hold
+    #: Range errors of :meth:`JointView.terms` at the solved transform, without scattered light: what
+    #: ``rig.toml`` can hold
     range_coefficients: Float64
     centre: Float64  #: (3,) working point, ToF frame, metres
-    #: (6, 6) of the twist (rho, phi) about ``centre`` in ToF axes that moves the truth to the result: leave-one-view-out,
-    #: widened for few views, plus the priors' part and the rims' common inset
+    #: (6, 6) of the twist (rho, phi) about ``centre`` in ToF axes that moves the truth to the result:
+    #: leave-one-view-out, widened for few views, plus the priors' part and the rims' common inset
     covariance: Float64
     #: (V, 6) twist by which each view alone departs from the others, as leaving it out shows
     influence: Float64

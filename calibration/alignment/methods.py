@@ -17,7 +17,7 @@ from calibration.alignment.averages import about, fuse, twist_about
 from calibration.alignment.joint import JointSolution, joint_icp
 from calibration.alignment.rounds import Solution
 from calibration.alignment.views import TERMS, joint_view_of
-from calibration.range_error.error import Terms, jackknife
+from calibration.range_error.terms import Terms, jackknife
 from calibration.registration.pairs import Pair
 from tofcapture.errors import ConfigError
 from tofcapture.files.view import read_view
@@ -203,16 +203,9 @@ def _uncertainty(influence: Float64, covariance: Float64) -> dict[str, Any]:
     }
 
 
-def degrees_mm(rotation: float, translation: float, suffix: str = "") -> dict[str, float]:
-    """Lay radians and metres out as ``rotation_deg`` and ``translation_mm``."""
-    return {
-        f"rotation{suffix}_deg": float(np.degrees(rotation)),
-        f"translation{suffix}_mm": 1e3 * float(translation),
-    }
-
-
 def _lengths(variances: Float64) -> dict[str, float]:
-    return degrees_mm(np.sqrt(variances[3:].sum()), np.sqrt(variances[:3].sum()))
+    moved, turned = np.sqrt(variances[:3].sum()), np.sqrt(variances[3:].sum())
+    return {"rotation_deg": float(np.degrees(turned)), "translation_mm": float(1e3 * moved)}
 
 
 def _left_out(solution: Solution, fused: Float64) -> tuple[Float64, Float64]:
@@ -230,5 +223,8 @@ def _weighted(solution: Solution, used: Sequence[int]) -> Float64:
 
 
 def _stated(T_tof_stereo: Float64, true: Float64 | None) -> dict[str, Any]:
-    error = {} if true is None else degrees_mm(*alignment_error(T_tof_stereo, true), "_error")
-    return {"T_tof_stereo": T_tof_stereo.tolist(), **error}
+    out: dict[str, Any] = {"T_tof_stereo": T_tof_stereo.tolist()}
+    if true is not None:
+        rotation, translation = alignment_error(T_tof_stereo, true)
+        out |= {"rotation_error_deg": float(np.degrees(rotation)), "translation_error_mm": 1e3 * translation}
+    return out

@@ -15,9 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.alignment.averages import Average, average_transforms
-from calibration.range_error.error import SIMPLE, Terms
+from calibration.range_error.terms import SIMPLE, Terms
 from calibration.registration.backends import COARSE_TO_FINE, FINE, register
-from calibration.registration.gate import Refusal, Registration, check_registration, residuals, tukey_weights
+from calibration.registration.gate import (
+    Refusal,
+    Registration,
+    check_registration,
+    residuals,
+    tukey_weights,
+)
 from calibration.registration.pairs import Pair
 from tofcapture.camera import Camera
 from tofcapture.errors import QualityError, TofError

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.range_error.error import SIMPLE, Terms
+from calibration.range_error.terms import SIMPLE, Terms
 from calibration.registration.clouds import (
     TOF_MARGIN,
     Cloud,
@@ -58,7 +58,7 @@ class JointView:
     def terms(self, frequency: int, coefficients: Float64) -> Float64:
         """Compute what each of U coefficients multiplies, (N, U), in the range error of one frequency.
 
-        They are ``TERMS`` of every frequency (:class:`calibration.range_error.error.Terms`), then the scattered shares, which
+        They are ``TERMS`` of every frequency (:class:`calibration.range_error.terms.Terms`), then the scattered shares, which
         all frequencies have in common. The error is a function of the true range, so the measured one is first freed of
         ``coefficients`` (U,).
         """

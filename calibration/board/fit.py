@@ -158,8 +158,8 @@ class Fit:
 
     T: Float64  #: (4, 4) ``T_camera_board``
     bias: float  #: Common range error of the surface points, metres; positive is measured too far
-    #: (6, 6) of (displacement of the board's origin, rotation vector), camera axes, m^2 and rad^2. Cluster-robust: what one
-    #: hole or one piece of the surface has in common counts once
+    #: (6, 6) of (displacement of the board's origin, rotation vector), camera axes, m^2 and rad^2.
+    #: Cluster-robust: what one hole or one piece of the surface has in common counts once
     covariance: Float64
 
 

@@ -1,23 +1,32 @@
-"""``tofcapture calibrate hand-eye``: where a camera sits on the hand or beside the arm, from files of poses or a recording."""
+"""``tofcapture calibrate hand-eye | bundle | board | coverage``: where the cameras sit on the arm, and the board that tells it."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tofcapture.cli.kit import written
+import numpy as np
+
+from calibration.cli.sensor import believed_rig, read_views, saved
+from tofcapture.cli import kit
 from tofcapture.command import Outcome
-from tofcapture.errors import DataError, UsageError
+from tofcapture.errors import DataError, QualityError, UsageError
+from tofcapture.poses import Float64, invert, rotation_log
 
 if TYPE_CHECKING:
+    from calibration.board.geometry import Board
+    from calibration.bundle import BoardFit, Bundle
     from calibration.hand_eye.solve import HandEye
-    from tofcapture.poses import Float64
+    from tofcapture.frames import View
+    from tofcapture.rig import Rig
 
 STREAM_BLOCKS = 20  # stretches of a stream whose errors are taken as independent
+AGREES = 3.0  # standard deviations per degree of freedom between the two rig transforms
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_hand_eye(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument(
         "inputs",
@@ -46,125 +55,251 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="RESULT.json", help="write the result here")
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run_hand_eye(args: argparse.Namespace) -> Outcome:
     """Calibrate from a file of pairs, two streams, or a recording."""
     from calibration.hand_eye.solve import solve_hand_eye, to_dict
 
     hand, target, extra, blocks = _pairs(args)
-    if args.inverted_target and not extra.get("stream"):
-        target = _inverted(target)
     result = solve_hand_eye(hand, target, eye_to_hand=args.eye_to_hand, blocks=blocks)
     data = {**to_dict(result), **extra}
-    return written(data, _hand_eye_table(result, data), args.out)
-
-
-def _inverted(poses: Float64) -> Float64:
-    from calibration.hand_eye.checks import clean
-    from calibration.hand_eye.closed_form import invert_all
-
-    return invert_all(clean(poses, "target poses"))
+    return kit.written(data, _hand_eye_table(result, data), args.out)
 
 
 def _pairs(args: argparse.Namespace) -> tuple[Float64, Float64, dict[str, Any], int | None]:
-    from calibration.hand_eye.files import read_pairs_said, read_poses
-    from calibration.hand_eye.forms import most_consistent
+    """Hand and target poses, what is said of them, and how many blocks of a stream share their errors."""
+    from calibration.hand_eye.files import most_consistent, read_pairs, read_poses
+    from calibration.hand_eye.pairs import make_stream, recording_pairs, stream_pairs
 
     paths = args.inputs
     if len(paths) == 1 and paths[0].is_dir():
-        from calibration.hand_eye.recording import recording_pairs
-
-        return *recording_pairs(paths[0]), {"camera": "stereo"}, None
+        with kit.progress() as progress:
+            hand, target = recording_pairs(paths[0], progress)
+        return hand, _turned(target, args), {"camera": "stereo"}, None
     if len(paths) == 1:
-        hand, target, said = read_pairs_said(paths[0])
-        return hand, target, {"read_as": said} if said else {}, None
+        hand, target, said = read_pairs(paths[0])
+        return hand, _turned(target, args), {"read_as": said} if said else {}, None
     if len(paths) != 2:
         raise UsageError(
             f"expected one file of pairs, one recording, or two files of poses, got {len(paths)} paths"
         )
     one, two = (read_poses(p) for p in paths)
-    n, m = (len(next(iter(r.poses.values()))) for r in (one, two))
-    t_hand, t_target = one.seconds, two.seconds
-    if n == m and args.time_offset is None and _together(t_hand, t_target):
-        hand, target, said = most_consistent(
-            one, two
-        )  # pose by pose, or the same times in both: pairs already
-        return hand, target, {"read_as": said} if said else {}, None
-    if t_hand is None or t_target is None:
-        raise DataError(f"expected as many poses in both files, or times before them, got {n} and {m} poses")
-    hand, target = (next(iter(r.poses.values())) for r in (one, two))
-    target = _inverted(target) if args.inverted_target else target
-    return _stream_pairs((t_hand, hand), (t_target, target), args.time_offset)
-
-
-def _together(t_hand: Float64 | None, t_target: Float64 | None) -> bool:
-    """Whether poses belong together one by one: no times, or the same ones."""
-    if t_hand is None or t_target is None:
-        return True
-    return bool((t_hand == t_target).all())
-
-
-def _stream_pairs(
-    hand: tuple[Float64, Float64], target: tuple[Float64, Float64], given: float | None
-) -> tuple[Float64, Float64, dict[str, Any], int]:
-    from calibration.hand_eye.closed_form import invert_all
-    from calibration.hand_eye.solve import refine_from_consensus
-    from calibration.hand_eye.time_offset import coarse_offset, make_stream, pairs_at, refine_offset
-
-    one, two = make_stream(*hand, "hand poses"), make_stream(*target, "target poses")
-    found: dict[str, Any] = {"stream": True, "time_offset_s": given}
-    if given is None:
-        start, correlation = coarse_offset(one, two)
-        A, B = pairs_at(one, two, start)
-        # The mount and the sense of the target may be wrong here; the gate says so once the clocks are right.
-        inverted = (
-            refine_from_consensus(invert_all(A), B).log_likelihood
-            > refine_from_consensus(A, B).log_likelihood
+    timed = one.seconds is not None and two.seconds is not None
+    # Pose by pose, or the same times in both: pairs already.
+    together = not timed or bool(np.array_equal(one.seconds, two.seconds))  # type: ignore[arg-type]
+    if len(one) == len(two) and args.time_offset is None and together:
+        hand, target, said = most_consistent(one, two)
+        return hand, _turned(target, args), {"read_as": said} if said else {}, None
+    if one.seconds is None or two.seconds is None:
+        raise DataError(
+            f"expected as many poses in both files, or times before them, got {len(one)} and {len(two)} poses"
         )
+    moving = make_stream(one.seconds, one.usual, "hand poses")
+    seen = make_stream(two.seconds, _turned(two.usual, args), "target poses")
+    hand, target, found = stream_pairs(moving, seen, args.time_offset)
+    return hand, target, {"stream": True, **found}, min(STREAM_BLOCKS, len(hand) // 5)
 
-        def cost(A: Float64, B: Float64) -> float:
-            return -refine_from_consensus(invert_all(A) if inverted else A, B).log_likelihood
 
-        offset, sigma = refine_offset(one, two, start, cost)
-        found |= {"time_offset_s": offset, "time_offset_sigma_s": number(sigma), "correlation": correlation}
-    A, B = pairs_at(one, two, float(found["time_offset_s"]))
-    return A, B, found, min(STREAM_BLOCKS, len(A) // 5)
+def _turned(target: Float64, args: argparse.Namespace) -> Float64:
+    from calibration.hand_eye.checks import clean
+    from calibration.hand_eye.closed_form import invert_all
+
+    return invert_all(clean(target, "target poses")) if args.inverted_target else target
 
 
 def _hand_eye_table(result: HandEye, data: dict[str, Any]) -> str:
-    import numpy as np
-
-    from tofcapture.poses import rotation_log
-
     name = "T_base_camera" if result.eye_to_hand else "T_flange_camera"
     t, phi = 1e3 * result.X[:3, 3], np.degrees(rotation_log(result.X[:3, :3]))
-    lines = [
-        f"{name}  {data['mount']}, {data['pairs']} pairs, {len(data['outliers'])} outliers",
-        f"  translation mm        {t[0]:10.2f} {t[1]:10.2f} {t[2]:10.2f}",
-        f"  rotation vector deg   {phi[0]:10.3f} {phi[1]:10.3f} {phi[2]:10.3f}",
-        "                        translation mm   rotation deg",
-    ]
-    rows = {
+    values = {
         "standard error": data["standard_error"],
         "noise per axis": data["noise"],
         "median residual": data["residual"]["median"],
         "largest residual": data["residual"]["max"],
         "leave one out": data["leave_one_out"],
     }
-    for label, value in rows.items():
-        shown = "-" if value is None else f"{value['translation_mm']:14.3f} {value['rotation_deg']:14.4f}"
-        lines.append(f"  {label:22}{shown}")
+    rows = [
+        (label, f"{v['translation_mm']:.3f}", f"{v['rotation_deg']:.4f}") if v else (label, "-", "-")
+        for label, v in values.items()
+    ]
     scale = data["target_scale"]
-    lines.append(f"  target scale          {scale['factor']:.4f} +- {scale['standard_error']:.4f}")
-    lines.append(
-        "  rotation of the hand  " + ", ".join(f"{a:.0f}" for a in data["motion_deg"]) + " deg RMS by axis"
-    )
-    for who, words in data.get("read_as", {}).items():
-        lines.append(f"  {who} read as          {words}")
+    lines = [
+        f"{name}  {data['mount']}, {data['pairs']} pairs, {len(data['outliers'])} outliers",
+        f"  translation mm        {_numbers(t, 10, 2)}",
+        f"  rotation vector deg   {_numbers(phi, 10, 3)}",
+        kit.table(("", "translation mm", "rotation deg"), rows, "  "),
+        f"  target scale          {scale['factor']:.4f} +- {scale['standard_error']:.4f}",
+        "  rotation of the hand  " + ", ".join(f"{a:.0f}" for a in data["motion_deg"]) + " deg RMS by axis",
+    ]
+    lines += [f"  {who} read as          {words}" for who, words in data.get("read_as", {}).items()]
     if "time_offset_s" in data:
         lines.append(f"  time offset           {1e3 * data['time_offset_s']:.1f} ms")
     return "\n".join([*lines, *(f"  look: {text}" for text in data["warnings"])])
 
 
-def number(value: float) -> float | None:
-    """Return the value, or None for NaN, which JSON does not have."""
-    return value if value == value else None  # noqa: PLR0124  NaN
+def _numbers(values: Any, width: int, digits: int) -> str:
+    return " ".join(f"{x:{width}.{digits}f}" for x in values)
+
+
+def configure_bundle(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    configure_coverage(parser)
+    parser.add_argument(
+        "--arm-sigma",
+        type=float,
+        nargs=2,
+        metavar=("M", "RAD"),
+        help="standard deviation of an arm pose per axis, metres and radians (default 0.0002 0.00017)",
+    )
+    parser.add_argument("--dry-run", action="store_true", help="print the result, write nothing")
+
+
+def run_bundle(args: argparse.Namespace) -> Outcome:
+    """Detect the board in every view, solve the bundle, write ``T_flange_tof`` into ``rig.toml`` and ``bundle.json``."""
+    from calibration.board.geometry import load_board
+    from calibration.bundle import ARM_SIGMA, solve_bundle
+
+    board, rig = load_board(args.board), believed_rig(args.recording)
+    arm, fits, refused = [], [], []
+    for i, (path, view) in enumerate(read_views(args.recording, "board")):
+        arm.append(view.arm_before.T_base_flange)
+        own, why = _fits_of(view, i, board)
+        fits += own
+        refused += [f"{path.stem} {text}" for text in why]
+    bundle = solve_bundle(np.stack(arm), fits, tuple(args.arm_sigma or ARM_SIGMA))
+    data = {**bundle_report(bundle, fits, rig), "refused": refused}
+    found = replace(rig, T_flange_tof=bundle.T_flange_tof)
+    return saved(args, "bundle.json", data, found, bundle_table(data))
+
+
+def _fits_of(view: View, index: int, board: Board) -> tuple[list[BoardFit], list[str]]:
+    """Board fits of both cameras in a view, and why a camera has none."""
+    from calibration.board.detector import detect, stereo_sight, tof_sight
+    from calibration.bundle import CAMERAS, BoardFit
+
+    fits, refused = [], []
+    for camera in CAMERAS:
+        try:
+            if camera == "tof":
+                found = detect(tof_sight(view.tof), board, view.tof.info.camera).fit
+            else:
+                found = detect(stereo_sight(view.stereo), board, view.stereo.info.camera).fit
+        except QualityError as err:
+            refused.append(f"{camera}: {err}")
+        else:
+            fits.append(BoardFit(index, camera, found.T, found.covariance))
+    return fits, refused
+
+
+def bundle_report(bundle: Bundle, fits: list[BoardFit], rig: Rig) -> dict[str, Any]:
+    """Lay a bundle out as JSON types, with its consistency with the rig's ``T_tof_stereo``."""
+    places = {
+        "T_flange_tof": bundle.T_flange_tof,
+        "T_flange_stereo": bundle.T_flange_stereo,
+        "T_base_board": bundle.T_base_board,
+    }
+    arm = np.sqrt(np.square(bundle.arm.reshape(-1, 2, 3)).mean(axis=(0, 2)))
+    return {
+        "format": "tofcapture-bundle",
+        "version": 1,
+        "units": "m",
+        **{name: T.tolist() for name, T in places.items()},
+        "standard_error": {name: _stated(bundle.sigma(i)) for i, name in enumerate(places)},
+        "covariance": bundle.covariance.tolist(),
+        "variance_factor": bundle.variance,
+        "views": len(bundle.arm),
+        "fits": {c: sum(f.camera == c for f in fits) for c in ("tof", "stereo")},
+        "outliers": [
+            f"view {f.view} {f.camera}" for f, bad in zip(fits, bundle.outliers, strict=True) if bad
+        ],
+        "arm_rms": {"translation_mm": 1e3 * float(arm[0]), "rotation_deg": float(np.degrees(arm[1]))},
+        "motion_deg": np.degrees(bundle.motion).tolist(),
+        "rig_check": consistency(bundle, rig.T_tof_stereo),
+        "moved": _difference(bundle.T_flange_tof, rig.T_flange_tof),
+    }
+
+
+def consistency(bundle: Bundle, T_tof_stereo: Float64) -> dict[str, Any]:
+    """Compare ``X_tof^-1 X_stereo`` with the rig transform that registration found, in the bundle's own standard deviations."""
+    D = T_tof_stereo @ invert(bundle.T_tof_stereo)
+    off = np.concatenate([T_tof_stereo[:3, 3] - bundle.T_tof_stereo[:3, 3], rotation_log(D[:3, :3])])
+    distance = float(np.sqrt(off @ np.linalg.solve(bundle.rig_covariance(), off) / 6))
+    return {
+        **_difference(bundle.T_tof_stereo, T_tof_stereo),
+        "standard_error": _stated(np.sqrt(np.diag(bundle.rig_covariance()))),
+        "sigmas": distance,
+        "agrees": distance < AGREES,
+    }
+
+
+def _difference(one: Float64, other: Float64) -> dict[str, float]:
+    turned = rotation_log(one[:3, :3].T @ other[:3, :3])
+    return {
+        "translation_mm": 1e3 * float(np.linalg.norm(one[:3, 3] - other[:3, 3])),
+        "rotation_deg": float(np.degrees(np.linalg.norm(turned))),
+    }
+
+
+def _stated(sigma: Float64) -> dict[str, list[float]]:
+    return {
+        "translation_mm": (1e3 * sigma[:3]).tolist(),
+        "rotation_deg": np.degrees(sigma[3:]).tolist(),
+    }
+
+
+def bundle_table(data: dict[str, Any]) -> str:
+    """Lay the report out for a person."""
+    rows = [
+        (
+            name,
+            _numbers(1e3 * np.array(data[name])[:3, 3], 9, 2),
+            _numbers(data["standard_error"][name]["translation_mm"], 7, 3),
+            _numbers(data["standard_error"][name]["rotation_deg"], 8, 4),
+        )
+        for name in ("T_flange_tof", "T_flange_stereo", "T_base_board")
+    ]
+    check, moved, fits = data["rig_check"], data["moved"], data["fits"]
+    verdict = "agrees" if check["agrees"] else "DISAGREES: align again, or look for a loose camera"
+    lines = [
+        kit.table(("", "translation mm", "+- mm", "+- deg"), rows),
+        f"fits               {fits['tof']} ToF, {fits['stereo']} stereo of {data['views']} views",
+        f"outliers           {', '.join(data['outliers']) or 'none'}; covariances scaled by {data['variance_factor']:.1f}",
+        f"T_flange_tof       moved by {_gap(moved)}",
+        f"rig transform      {_gap(check)} from the rig's, {check['sigmas']:.1f} sigma: {verdict}",
+    ]
+    return "\n".join([*lines, *(f"refused            {text}" for text in data["refused"])])
+
+
+def _gap(found: dict[str, Any]) -> str:
+    return f"{found['translation_mm']:.2f} mm, {found['rotation_deg']:.3f} deg"
+
+
+def configure_board(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        "--board",
+        default="default",
+        help="packaged board (default, second) or a TOML file; see docs/board.md",
+    )
+    for kind, words in (("svg", "to print"), ("dxf", "to cut"), ("stl", "to print in 3-D")):
+        parser.add_argument(
+            f"--{kind}", type=Path, metavar="OUT", help=f"write the drawing {words}, true scale"
+        )
+
+
+def run_board(args: argparse.Namespace) -> Outcome:
+    """Draw a board."""
+    from calibration.board.drawing import run_board
+
+    return run_board(args)
+
+
+def configure_coverage(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help="folder with calibration views")
+    parser.add_argument("--board", default="default", help="packaged board or a TOML file")
+
+
+def run_coverage(args: argparse.Namespace) -> Outcome:
+    """Print what the views cover."""
+    from calibration.board.coverage import run_coverage
+
+    return run_coverage(args)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.alignment.methods import alignment_error, degrees_mm
+from calibration.alignment.methods import alignment_error
 from calibration.alignment.rounds import Solution
 from calibration.limits import Judged, judged, worst
 from calibration.registration.pairs import Pair
@@ -49,12 +48,12 @@ def evidence_of(
         "used": len(solution.used),
         "T_tof_stereo": T_tof_stereo.tolist(),
         "initial_T_tof_stereo": initial.tolist(),
-        "spread": degrees_mm(*solution.average.spread),
-        "standard_error": degrees_mm(*solution.average.standard_error),
+        "spread": _degrees_mm(*solution.average.spread),
+        "standard_error": _degrees_mm(*solution.average.standard_error),
         "working_point_m": solution.working_point.tolist(),
         "range_residual": range_error_table(solution.residual),
         "pairs": rows,
-        "truth": None if true is None else degrees_mm(*alignment_error(T_tof_stereo, true), "_error"),
+        "truth": None if true is None else _degrees_mm(*alignment_error(T_tof_stereo, true), "_error"),
         "provenance": {
             "versions": _versions(backend),
             "inputs": {pair.name: pair.sha256 for pair in pairs},
@@ -85,7 +84,7 @@ def judged_evidence(evidence: Mapping[str, Any]) -> list[Judged]:
     moved = np.asarray(evidence["initial_T_tof_stereo"]) @ invert(np.asarray(evidence["T_tof_stereo"]))
     point = np.asarray(evidence["working_point_m"], dtype=np.float64)
     shift = float(np.linalg.norm(transform_points(moved, point) - point))
-    out += _both("initial", degrees_mm(rotation_angle(moved), shift))
+    out += _both("initial", _degrees_mm(rotation_angle(moved), shift))
     if truth := evidence["truth"]:
         out += _both("truth", truth, "_error")
     return out
@@ -116,6 +115,13 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
+def _degrees_mm(rotation: float, translation: float, suffix: str = "") -> dict[str, float]:
+    return {
+        f"rotation{suffix}_deg": float(np.degrees(rotation)),
+        f"translation{suffix}_mm": 1e3 * float(translation),
+    }
+
+
 def _both(key: str, found: Mapping[str, float], suffix: str = "") -> list[Judged]:
     return [
         judged(f"{key}_rotation", found[f"rotation{suffix}_deg"]),
@@ -139,16 +145,23 @@ def _pair(i: int, pair: Pair, solution: Solution) -> dict[str, Any]:
     }
     if i in solution.passed:
         k = solution.passed.index(i)
-        out |= degrees_mm(average.rotation_from_mean[k], average.translation_from_mean[k], "_from_mean")
+        out["rotation_from_mean_deg"] = float(np.degrees(average.rotation_from_mean[k]))
+        out["translation_from_mean_mm"] = 1e3 * float(average.translation_from_mean[k])
     return out
 
 
 def _versions(backend: str) -> dict[str, str]:
     out = {}
-    libraries = ("open3d-cpu", "open3d") if backend == "open3d" else (backend,)
-    for name in ("tofcapture", "numpy", "scipy", *libraries):
-        with suppress(PackageNotFoundError):
+    for name in (
+        "tofcapture",
+        "numpy",
+        "scipy",
+        *(("open3d-cpu", "open3d") if backend == "open3d" else (backend,)),
+    ):
+        try:
             out[name] = version(name)
+        except PackageNotFoundError:
+            continue
     return out
 
 

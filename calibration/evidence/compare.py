@@ -23,9 +23,11 @@ class Drift:
     #: Radians; metres at the working point
     rotation: float
     translation: float
-    #: (6,) (rho, phi): displacement of the working point and rotation vector, ToF frame, new against old
+    #: (6,) (rho, phi): displacement of the working point and rotation vector, ToF frame, new against
+    #: old
     twist: Float64
-    #: Square root of the Mahalanobis distance squared over its six degrees of freedom: about 1 where nothing moved
+    #: Square root of the Mahalanobis distance squared over its six degrees of freedom: about 1 where
+    #: nothing moved
     sigmas: float
     probability: float  #: Of a drift as large by chance (chi-square, 6 degrees of freedom)
     basis: str  #: What the uncertainty was taken from

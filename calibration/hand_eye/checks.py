@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.hand_eye.closed_form import nearest_rotation, relative_motions, rotation_vectors, screws
-from calibration.hand_eye.refusal import Cause, HandEyeRefused
-from tofcapture.errors import DataError
+from calibration.hand_eye.closed_form import nearest_rotation, relative_motions, rotation_vectors
+from tofcapture.errors import DataError, QualityError
 from tofcapture.poses import Float64
 
 MIN_PAIRS = 3
@@ -21,7 +20,47 @@ REACH = 20.0  # m; no arm reaches farther, so longer translations are millimetre
 ORTHONORMAL = 1e-3  # rotations printed with four digits pass, scaled or sheared ones do not
 COUPLES = 120  # pairs whose couples are compared; more cost time and change no verdict
 
+FAULTS = (
+    ("NaN or infinity", "the target was probably not found there"),
+    (
+        "no rotation (its rows are not of length 1 and orthogonal)",
+        "the matrix may hold a scale, be transposed with its translation, or not be a pose",
+    ),
+    ("a left-handed rotation (determinant -1)", "mirrored axes: one axis of this frame points the wrong way"),
+    ("a last row other than 0 0 0 1", "the matrix may be transposed"),
+)
 MORE_ROTATION = "rotate the hand by 30 degrees and more about at least two different axes between views"
+
+
+class Cause(StrEnum):
+    """Why pairs were refused."""
+
+    TOO_FEW = "too few pairs"
+    PURE_TRANSLATION = "pure translation"
+    SMALL_ROTATIONS = "rotations too small"
+    SINGLE_AXIS = "single rotation axis"
+    SHUFFLED = "shuffled or mismatched pairs"
+    SHIFTED = "pairs shifted against each other"
+    QUATERNION_ORDER = "quaternion order"
+    ROTATION_INVERTED = "rotations inverted"
+    EYE_CONFUSED = "eye-in-hand and eye-to-hand confused"
+    TARGET_INVERTED = "target pose inverted"
+    SWAPPED = "columns swapped or both inverted"
+    MIRRORED = "mirrored axes"
+    WRONG_UNITS = "wrong units"
+    TARGET_SCALE = "wrong target size"
+    TWO_BOARDS = "two boards confused"
+    MOVED = "something was moved"
+    INCONSISTENT = "inconsistent pairs"
+    TIME_OFFSET = "time offset not found"
+
+
+class HandEyeRefused(QualityError):  # noqa: N818  a gate's answer is a refusal, not a fault
+    """Pairs that cannot give a good hand-eye calibration; the message begins with ``cause``."""
+
+    def __init__(self, cause: Cause, message: str, hint: str = "") -> None:
+        super().__init__(f"hand-eye refused, {cause}: {message}", hint)
+        self.cause = cause
 
 
 def clean(T: ArrayLike, name: str) -> Float64:
@@ -35,43 +74,21 @@ def clean(T: ArrayLike, name: str) -> Float64:
     out = np.array(T, dtype=np.float64)
     if out.ndim != 3 or out.shape[1:] != (4, 4):
         raise DataError(f"{name}: expected (N, 4, 4) transforms, got shape {out.shape}")
-    _refuse_first(
-        np.asarray(~np.isfinite(out).all(axis=(1, 2))),
-        name,
-        "NaN or infinity",
-        "the target was probably not found there",
-    )
     R = out[:, :3, :3]
-    defect = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0)
-    _refuse_first(
-        defect > ORTHONORMAL,
-        name,
-        "no rotation (its rows are not of length 1 and orthogonal)",
-        "the matrix may hold a scale, be transposed with its translation, or not be a pose",
-    )
-    _refuse_first(
-        np.linalg.det(R) < 0,
-        name,
-        "a left-handed rotation (determinant -1)",
-        "mirrored axes: one axis of this frame points the wrong way",
-    )
-    _refuse_first(
-        np.abs(out[:, 3] - [0, 0, 0, 1]).max(axis=1) > 1e-6,
-        name,
-        "a last row other than 0 0 0 1",
-        "the matrix may be transposed",
-    )
+    with np.errstate(invalid="ignore"):
+        defect = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0)
+        bad = (
+            ~np.isfinite(out).all(axis=(1, 2)),
+            defect > ORTHONORMAL,
+            np.linalg.det(R) < 0,
+            np.abs(out[:, 3] - [0, 0, 0, 1]).max(axis=1) > 1e-6,
+        )
+    for where, (got, hint) in zip(np.stack(bad), FAULTS, strict=True):
+        if where.any():
+            count = f"in pair {int(np.argmax(where))} ({int(where.sum())} of {len(where)} pairs)"
+            raise DataError(f"{name}: expected rigid transforms, got {got} {count}", hint)
     out[:, :3, :3] = nearest_rotation(R)
     return out
-
-
-def _refuse_first(bad: NDArray[np.bool_], name: str, got: str, hint: str) -> None:
-    if bad.any():
-        i = int(np.argmax(bad))
-        raise DataError(
-            f"{name}: expected rigid transforms, got {got} in pair {i} ({int(bad.sum())} of {len(bad)} pairs)",
-            hint,
-        )
 
 
 def check_numbers(A: Float64, B: Float64) -> None:
@@ -90,11 +107,8 @@ def check_numbers(A: Float64, B: Float64) -> None:
             hint="every pair needs both; drop the views without a target on both sides",
         )
     if len(A) < MIN_PAIRS:
-        raise HandEyeRefused(
-            Cause.TOO_FEW,
-            f"expected at least {MIN_PAIRS}, better 15 to 30, got {len(A)}",
-            "record more views",
-        )
+        got = f"expected at least {MIN_PAIRS}, better 15 to 30, got {len(A)}"
+        raise HandEyeRefused(Cause.TOO_FEW, got, "record more views")
     for name, T in (("hand", A), ("target", B)):
         size = float(np.median(np.linalg.norm(T[:, :3, 3], axis=1)))
         if size > REACH:
@@ -122,30 +136,8 @@ def check_motion(A: Float64, B: Float64) -> tuple[float, float, float]:
     HandEyeRefused
         Pure translation, rotations too small, a single rotation axis; mismatched pairs when only the hand turns.
     """
-    thin = _thinned(len(A))
-    moves = dict(zip(("hand", "target"), relative_motions(A[thin], B[thin]), strict=True))
-    spread = {name: _spread(M) for name, M in moves.items()}
-    _check_hand(spread["hand"])
-    largest, sigma = spread["target"]
-    if largest < PURE_TRANSLATION or sigma[1] < SINGLE_AXIS:
-        raise HandEyeRefused(
-            Cause.SHUFFLED,
-            f"the hand turns about two axes, the target poses by at most {np.degrees(largest):.1f} deg "
-            f"({np.degrees(sigma[1]):.1f} deg across their main axis)",
-            "the target poses may belong to another recording, or a tracker has frozen",
-        )
-    hand = spread["hand"][1]
-    return float(hand[0]), float(hand[1]), float(hand[2])
-
-
-def _spread(M: Float64) -> tuple[float, Float64]:
-    phi = rotation_vectors(M[:, :3, :3])
-    sigma = np.linalg.svd(phi, compute_uv=False) / np.sqrt(len(phi))
-    return float(np.quantile(np.linalg.norm(phi, axis=1), 0.95)), sigma
-
-
-def _check_hand(spread: tuple[float, Float64]) -> None:
-    largest, sigma = spread
+    (largest, sigma), (largest_seen, sigma_seen) = (_spread(M) for M in _couples(A, B))
+    degrees = np.degrees(sigma)
     if largest < PURE_TRANSLATION:
         raise HandEyeRefused(
             Cause.PURE_TRANSLATION,
@@ -161,33 +153,17 @@ def _check_hand(spread: tuple[float, Float64]) -> None:
     if sigma[1] < SINGLE_AXIS:
         raise HandEyeRefused(
             Cause.SINGLE_AXIS,
-            f"expected rotations about two axes, got {np.degrees(sigma[0]):.0f} deg about one axis "
-            f"and {np.degrees(sigma[1]):.2f} deg across it",
+            f"expected rotations about two axes, got {degrees[0]:.0f} deg about one axis and {degrees[1]:.2f} deg across it",
             f"the translation along that axis is free: {MORE_ROTATION}",
         )
-
-
-def angle_mismatch(A: Float64, B: Float64) -> float:
-    """How much the rotation angles of hand and target differ, as a share of what random pairing would give.
-
-    A rigid mount makes the screws of ``A_ij`` and ``B_ij`` congruent: same angle, same translation along the axis (Chen,
-    CVPR 1991). The angle is free of units, of mirroring and of inversion, so what breaks it is the pairing.
-    """
-    if len(A) < MIN_PAIRS:
-        return np.inf
-    thin = _thinned(len(A))
-    A_ij, B_ij = relative_motions(A[thin], B[thin])
-    a, b = screws(A_ij)[0], screws(B_ij)[0]
-    random = np.median(np.abs(a[:, None] - b[None, :: max(1, len(b) // 500)]))
-    return float(np.median(np.abs(a - b)) / max(float(random), 1e-9))
-
-
-def slide_mismatch(A: Float64, B: Float64) -> float:
-    """Median difference (metres) of the translations along the screw axes of hand and target."""
-    thin = _thinned(len(A))
-    (a, along_a), (_, along_b) = (screws(M) for M in relative_motions(A[thin], B[thin]))
-    turned = (a > SMALL_ROTATIONS) & (a < np.radians(170))
-    return float(np.median(np.abs(along_a - along_b)[turned])) if turned.any() else float("nan")
+    if largest_seen < PURE_TRANSLATION or sigma_seen[1] < SINGLE_AXIS:
+        raise HandEyeRefused(
+            Cause.SHUFFLED,
+            f"the hand turns about two axes, the target poses by at most {np.degrees(largest_seen):.1f} deg "
+            f"({np.degrees(sigma_seen[1]):.1f} deg across their main axis)",
+            "the target poses may belong to another recording, or a tracker has frozen",
+        )
+    return float(sigma[0]), float(sigma[1]), float(sigma[2])
 
 
 def check_pairing(A: Float64, B: Float64) -> None:
@@ -198,12 +174,17 @@ def check_pairing(A: Float64, B: Float64) -> None:
     HandEyeRefused
         Pairs shifted against each other, or shuffled.
     """
-    mismatch = angle_mismatch(A, B)
+    mismatch = _angle_mismatch(A, B)
     if mismatch <= MISMATCH:
         return
-    for cause, got, hint, A_try, B_try in _shifts(A, B):
-        if angle_mismatch(A_try, B_try) < min(MISMATCH, 0.5 * mismatch):
-            raise HandEyeRefused(cause, got, hint)
+    for k in (1, -1, 2, -2, 3, -3):
+        shifted = A[max(0, -k) : len(A) - max(0, k)], B[max(0, k) : len(B) - max(0, -k)]
+        if _angle_mismatch(*shifted) < min(MISMATCH, 0.5 * mismatch):
+            raise HandEyeRefused(
+                Cause.SHIFTED,
+                f"hand pose i belongs to target pose i {'+' if k > 0 else '-'} {abs(k)}",
+                "one list misses or repeats poses at its beginning",
+            )
     raise HandEyeRefused(
         Cause.SHUFFLED,
         "the rotation angles of hand and target agree no better than at random "
@@ -212,25 +193,46 @@ def check_pairing(A: Float64, B: Float64) -> None:
     )
 
 
-Trial = tuple[Cause, str, str, Float64, Float64]
+def slide_mismatch(A: Float64, B: Float64) -> float:
+    """Return the median difference (metres) of the translations along the screw axes of hand and target."""
+    (a, along_a), (_, along_b) = (_screws(M) for M in _couples(A, B))
+    turned = (a > SMALL_ROTATIONS) & (a < np.radians(170))
+    return float(np.median(np.abs(along_a - along_b)[turned])) if turned.any() else float("nan")
 
 
-def _shifts(A: Float64, B: Float64) -> Iterator[Trial]:
-    for k in (1, -1, 2, -2, 3, -3):
-        yield (
-            Cause.SHIFTED,
-            f"hand pose i belongs to target pose i {'+' if k > 0 else '-'} {abs(k)}",
-            "one list misses or repeats poses at its beginning",
-            A[max(0, -k) : len(A) - max(0, k)],
-            B[max(0, k) : len(B) - max(0, -k)],
-        )
+def thinned(count: int, most: int) -> NDArray[np.intp]:
+    """Choose at most so many indices, evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))
 
 
-def _thinned(count: int) -> NDArray[np.intp]:
-    return np.unique(np.linspace(0, count - 1, min(count, COUPLES)).round().astype(np.intp))
+def _couples(A: Float64, B: Float64) -> tuple[Float64, Float64]:
+    few = thinned(len(A), COUPLES)
+    return relative_motions(A[few], B[few])
 
 
-def listed(indices: NDArray[np.integer]) -> str:
-    """Name at most eight pairs."""
-    shown = ", ".join(str(int(i)) for i in indices[:8])
-    return shown + (f" and {len(indices) - 8} more" if len(indices) > 8 else "")
+def _spread(M: Float64) -> tuple[float, Float64]:
+    """95th percentile of the rotations of motions, and their RMS about three principal axes, radians."""
+    phi = rotation_vectors(M[:, :3, :3])
+    sigma = np.linalg.svd(phi, compute_uv=False) / np.sqrt(len(phi))
+    return float(np.quantile(np.linalg.norm(phi, axis=1), 0.95)), sigma
+
+
+def _screws(M: Float64) -> tuple[Float64, Float64]:
+    """Rotation angle (N,) and translation along the axis (N,) of motions, which hand and eye must share."""
+    phi = rotation_vectors(M[:, :3, :3])
+    angle = np.linalg.norm(phi, axis=1)
+    axis = phi / np.maximum(angle, 1e-12)[:, None]
+    return angle, np.einsum("ni,ni->n", axis, M[:, :3, 3])
+
+
+def _angle_mismatch(A: Float64, B: Float64) -> float:
+    """How much the rotation angles of hand and target differ, as a share of what random pairing would give.
+
+    A rigid mount makes the screws of ``A_ij`` and ``B_ij`` congruent: same angle, same translation along the axis (Chen,
+    CVPR 1991). The angle is free of units, of mirroring and of inversion, so what breaks it is the pairing.
+    """
+    if len(A) < MIN_PAIRS:
+        return np.inf
+    a, b = (_screws(M)[0] for M in _couples(A, B))
+    random = np.median(np.abs(a[:, None] - b[None, :: max(1, len(b) // 500)]))
+    return float(np.median(np.abs(a - b)) / max(float(random), 1e-9))

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.hand_eye.checks import listed, slide_mismatch
-from calibration.hand_eye.closed_form import invert_all
-from calibration.hand_eye.consensus import Consensus, consensus
-from calibration.hand_eye.refusal import Cause, HandEyeRefused
+from calibration.hand_eye.checks import Cause, HandEyeRefused, slide_mismatch, thinned
+from calibration.hand_eye.closed_form import Consensus, consensus, invert_all
 from tofcapture.poses import Float64
 
 BETTER = 3.0  # times less noise: another reading of the numbers is believed
@@ -35,7 +33,7 @@ class Mistake:
 
 
 def oriented(A: Float64, *, eye_to_hand: bool) -> Float64:
-    """Hand poses as the P of :mod:`calibration.hand_eye.closed_form`."""
+    """Return hand poses as the P of :mod:`calibration.hand_eye.closed_form`."""
     return invert_all(A) if eye_to_hand else A
 
 
@@ -57,10 +55,11 @@ def check_agreement(A: Float64, B: Float64, found: Consensus, *, eye_to_hand: bo
         With the cause that explains the pairs best.
     """
     P = oriented(A, eye_to_hand=eye_to_hand)
-    thin = np.unique(np.linspace(0, len(A) - 1, min(len(A), SHOWN)).round().astype(np.intp))
+    few = thinned(len(A), SHOWN)
     if found.score > GOOD:
-        _check_mistakes(A[thin], B[thin], eye_to_hand=eye_to_hand)
-        _check_scale(P[thin], B[thin])
+        given = consensus(P[few], B[few])
+        _check_mistakes(A[few], B[few], given, eye_to_hand=eye_to_hand)
+        _check_scale(P[few], B[few], given)
     _check_roles(A, B, found, eye_to_hand=eye_to_hand)
     noisy = found.noise[0] > LIMIT[0] or found.noise[1] > LIMIT[1]
     if not noisy and found.inliers.mean() >= AGREE:
@@ -68,63 +67,70 @@ def check_agreement(A: Float64, B: Float64, found: Consensus, *, eye_to_hand: bo
     _check_second(P, B, found)
     raise HandEyeRefused(
         Cause.INCONSISTENT if noisy else Cause.SHUFFLED,
-        f"{int(found.inliers.sum())} of {len(P)} pairs agree, with {1e3 * found.noise[0]:.1f} mm and "
-        f"{np.degrees(found.noise[1]):.2f} deg per axis; expected {100 * AGREE:.0f} % within "
+        f"{int(found.inliers.sum())} of {len(P)} pairs agree, with {_in_words(found)}; expected {100 * AGREE:.0f} % within "
         f"{1e3 * LIMIT[0]:.0f} mm and {np.degrees(LIMIT[1]):.0f} deg "
         f"(slide along the screws differs by {1e3 * slide_mismatch(A, B):.1f} mm)",
         "check that the target is rigid and fully seen, that the arm stood still, and that pairs are of one moment",
     )
 
 
-def _penalty(found: Consensus) -> float:
-    return found.score / max(float(found.inliers.mean()), 1e-9)
+def target_scale(P: Float64, B: Float64, rotation: Float64) -> tuple[float, float]:
+    """Find the factor by which the target's distances must be multiplied to fit the arm's, and its standard deviation.
+
+    Linear least squares in (t_X, t_Z, s) of ``R_P t_X - t_Z + s R_P R_X t_B = -t_P``.
+    """
+    n = len(P)
+    left = np.zeros((n, 3, 7))
+    left[:, :, :3], left[:, :, 3:6] = P[:, :3, :3], -np.eye(3)
+    left[:, :, 6] = np.einsum("nij,jk,nk->ni", P[:, :3, :3], rotation, B[:, :3, 3])
+    M, right = left.reshape(-1, 7), -P[:, :3, 3].reshape(-1)
+    solution = np.linalg.lstsq(M, right, rcond=None)[0]
+    freedom = max(3 * n - 7, 1)
+    variance = float(np.square(M @ solution - right).sum()) / freedom * np.linalg.pinv(M.T @ M)[6, 6]
+    return float(solution[6]), float(np.sqrt(variance))
 
 
-def _check_mistakes(A: Float64, B: Float64, *, eye_to_hand: bool) -> None:
-    given = consensus(oriented(A, eye_to_hand=eye_to_hand), B)
-    trials = [
-        (_penalty(consensus(oriented(m.A, eye_to_hand=eye_to_hand), m.B)), m)
-        for m in _mistakes(A, B, eye_to_hand)
-    ]
-    score, best = min(trials, key=lambda trial: trial[0])
-    if score < _penalty(given) / BETTER:
+def _in_words(found: Consensus) -> str:
+    return f"{1e3 * found.noise[0]:.1f} mm and {np.degrees(found.noise[1]):.2f} deg per axis"
+
+
+def _check_mistakes(A: Float64, B: Float64, given: Consensus, *, eye_to_hand: bool) -> None:
+    mistakes = list(_mistakes(A, B, eye_to_hand=eye_to_hand))
+    penalties = [consensus(oriented(m.A, eye_to_hand=eye_to_hand), m.B).penalty for m in mistakes]
+    best = int(np.argmin(penalties))
+    if penalties[best] < given.penalty / BETTER:
         raise HandEyeRefused(
-            best.cause,
-            f"read as given, the pairs leave {1e3 * given.noise[0]:.1f} mm and {np.degrees(given.noise[1]):.2f} deg "
-            f"per axis; with this mistake undone {_penalty(given) / score:.0f} times less",
-            best.hint,
+            mistakes[best].cause,
+            f"read as given, the pairs leave {_in_words(given)}; "
+            f"with this mistake undone {given.penalty / penalties[best]:.0f} times less",
+            mistakes[best].hint,
         )
 
 
-def _mistakes(A: Float64, B: Float64, eye_to_hand: bool) -> Iterator[Mistake]:
+def _mistakes(A: Float64, B: Float64, *, eye_to_hand: bool) -> Iterator[Mistake]:
     yield _inverted(A, B, eye_to_hand=eye_to_hand)
-    yield from _mirrored(A, B)
+    # A reflection of either frame differs from this one by a rotation, which the solution absorbs.
+    S = np.diag([1.0, 1.0, -1.0, 1.0])
+    left_handed = "one of the two systems is left-handed (an axis points the wrong way)"
+    yield Mistake(Cause.MIRRORED, f"the target poses fit once mirrored: {left_handed}", A, S @ B @ S)
+    for name, sign in zip("xyz", 1 - 2 * np.eye(3), strict=True):
+        hint = f"translations have the wrong sign along {name}"
+        yield Mistake(Cause.MIRRORED, f"the target {hint}", A, _scaled(B, sign))
+        yield Mistake(Cause.MIRRORED, f"the hand {hint}", _scaled(A, sign), B)
     for name, metres in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
         hint = "the {} translations are in {} while the others are in metres"
         yield Mistake(Cause.WRONG_UNITS, hint.format("target", name), A, _scaled(B, metres))
         yield Mistake(Cause.WRONG_UNITS, hint.format("hand", name), _scaled(A, metres), B)
-    for change, cause, what in (
-        (_reordered, Cause.QUATERNION_ORDER, "were read as x, y, z, w and are w, x, y, z"),
-        (
-            _transposed,
-            Cause.ROTATION_INVERTED,
-            "are inverted while its translations are not: JPL or transposed",
-        ),
-    ):
+    reordered = (_reordered, Cause.QUATERNION_ORDER, "were read as x, y, z, w and are w, x, y, z")
+    transposed = (
+        _transposed,
+        Cause.ROTATION_INVERTED,
+        "are inverted while its translations are not: JPL or transposed",
+    )
+    for change, cause, what in (reordered, transposed):
         yield Mistake(cause, f"the hand's rotations {what}", change(A), B)
         yield Mistake(cause, f"the target's rotations {what}", A, change(B))
         yield Mistake(cause, f"the rotations of both {what}", change(A), change(B))
-
-
-def in_view(T: Float64) -> float:
-    """Share of target poses (N, 4, 4) within 45 degrees of the optical axis of a camera with z forward."""
-    t = T[:, :3, 3]
-    return float(np.mean(t[:, 2] > np.hypot(t[:, 0], t[:, 1])))
-
-
-def _off_axis(T: Float64) -> float:
-    t = T[:, :3, 3]
-    return float(np.median(np.hypot(t[:, 0], t[:, 1]) / np.maximum(t[:, 2], 1e-9)))
 
 
 def _inverted(A: Float64, B: Float64, *, eye_to_hand: bool) -> Mistake:
@@ -137,9 +143,20 @@ def _inverted(A: Float64, B: Float64, *, eye_to_hand: bool) -> Mistake:
     back = invert_all(B)
     eye = f"the data are {other}, or the hand poses are given as T_flange_base"
     target = "expected the target in the camera, T_camera_target; these look like T_target_camera (--inverted-target)"
-    if (in_view(back), -_off_axis(back)) > (in_view(B), -_off_axis(B)):
+    if (_in_view(back), -_off_axis(back)) > (_in_view(B), -_off_axis(B)):
         return Mistake(Cause.TARGET_INVERTED, f"{target}. Otherwise {eye}", A, back)
     return Mistake(Cause.EYE_CONFUSED, f"{eye}. Otherwise {target}", invert_all(A), B)
+
+
+def _in_view(T: Float64) -> float:
+    """Share of target poses (N, 4, 4) within 45 degrees of the optical axis of a camera with z forward."""
+    t = T[:, :3, 3]
+    return float(np.mean(t[:, 2] > np.hypot(t[:, 0], t[:, 1])))
+
+
+def _off_axis(T: Float64) -> float:
+    t = T[:, :3, 3]
+    return float(np.median(np.hypot(t[:, 0], t[:, 1]) / np.maximum(t[:, 2], 1e-9)))
 
 
 def _check_roles(A: Float64, B: Float64, found: Consensus, *, eye_to_hand: bool) -> None:
@@ -153,38 +170,21 @@ def _check_roles(A: Float64, B: Float64, found: Consensus, *, eye_to_hand: bool)
     if found.score > FAIR:
         return
     back, reversed_roles = invert_all(B), long > MOUNT > short
-    swapped = in_view(A) >= 0.95 and in_view(B) < 0.5 and (eye_to_hand or long > short)
+    swapped = _in_view(A) >= 0.95 and _in_view(B) < 0.5 and (eye_to_hand or long > short)
     swapped |= not eye_to_hand and reversed_roles and _better_view(A, B)
     inverted = reversed_roles and _better_view(back, B)
     if swapped or inverted:
         got = "the columns are swapped" if swapped else "both poses are inverted"
         raise HandEyeRefused(
             Cause.SWAPPED,
-            f"{got}: the target is in view of the camera in {100 * in_view(B):.0f} % of the pairs and the mount on the hand is "
-            f"{long:.2f} m long; read the other way {100 * in_view(A if swapped else back):.0f} % and {short:.2f} m",
+            f"{got}: the target is in view of the camera in {100 * _in_view(B):.0f} % of the pairs and the mount on the hand is "
+            f"{long:.2f} m long; read the other way {100 * _in_view(A if swapped else back):.0f} % and {short:.2f} m",
             "expected [hand in base, target in camera]: T_base_flange and T_camera_target",
         )
 
 
 def _better_view(other: Float64, B: Float64) -> bool:
-    return in_view(other) >= 0.95 and _off_axis(other) < 0.8 * _off_axis(B)
-
-
-def _mirrored(A: Float64, B: Float64) -> Iterator[Mistake]:
-    # A reflection of either frame differs from this one by a rotation, which the solution absorbs.
-    S = np.diag([1.0, 1.0, -1.0, 1.0])
-    yield Mistake(
-        Cause.MIRRORED,
-        "the target poses fit once mirrored: one of the two systems is left-handed (an axis points the wrong way)",
-        A,
-        S @ B @ S,
-    )
-    for axis, name in enumerate("xyz"):
-        sign = np.ones(3)
-        sign[axis] = -1
-        hint = f"translations have the wrong sign along {name}"
-        yield Mistake(Cause.MIRRORED, f"the target {hint}", A, _scaled(B, sign))
-        yield Mistake(Cause.MIRRORED, f"the hand {hint}", _scaled(A, sign), B)
+    return _in_view(other) >= 0.95 and _off_axis(other) < 0.8 * _off_axis(B)
 
 
 def _reordered(T: Float64) -> Float64:
@@ -209,29 +209,12 @@ def _scaled(T: Float64, factor: float | Float64) -> Float64:
     return out
 
 
-def target_scale(P: Float64, B: Float64, rotation: Float64) -> tuple[float, float]:
-    """Factor by which the target's distances must be multiplied to fit the arm's, and its standard deviation.
-
-    Linear least squares in (t_X, t_Z, s) of ``R_P t_X - t_Z + s R_P R_X t_B = -t_P``.
-    """
-    n = len(P)
-    lever = np.einsum("nij,jk,nk->ni", P[:, :3, :3], rotation, B[:, :3, 3])
-    left = np.zeros((n, 3, 7))
-    left[:, :, :3], left[:, :, 3:6], left[:, :, 6] = P[:, :3, :3], -np.eye(3), lever
-    M, right = left.reshape(-1, 7), -P[:, :3, 3].reshape(-1)
-    solution = np.linalg.lstsq(M, right, rcond=None)[0]
-    freedom = max(3 * n - 7, 1)
-    variance = float(np.square(M @ solution - right).sum()) / freedom * np.linalg.pinv(M.T @ M)[6, 6]
-    return float(solution[6]), float(np.sqrt(variance))
-
-
-def _check_scale(P: Float64, B: Float64) -> None:
-    given = consensus(P, B)
+def _check_scale(P: Float64, B: Float64, given: Consensus) -> None:
     kept = given.inliers
     scale, sigma = target_scale(P[kept], B[kept], given.X[:3, :3])
     if abs(scale - 1) < max(WRONG_SIZE, 5 * sigma) or scale <= 0:
         return
-    if _penalty(consensus(P, _scaled(B, scale))) < _penalty(given) / BETTER:
+    if consensus(P, _scaled(B, scale)).penalty < given.penalty / BETTER:
         raise HandEyeRefused(
             Cause.TARGET_SCALE,
             f"the target's distances must be multiplied by {scale:.3f} (+- {sigma:.3f}) to fit the hand's",
@@ -245,22 +228,21 @@ def _check_second(P: Float64, B: Float64, found: Consensus) -> None:
     if len(rest) < 5:
         return
     second = consensus(P[rest], B[rest])
-    if (
-        second.inliers.mean() < SECOND
-        or second.noise[1] > LIMIT[1]
-        or second.noise[0] > min(LIMIT[0], 5 * found.noise[0] + 1e-3)
-    ):
+    limit = min(LIMIT[0], 5 * found.noise[0] + 1e-3)
+    if second.inliers.mean() < SECOND or second.noise[0] > limit or second.noise[1] > LIMIT[1]:
         return
-    cut = int(np.argmax(np.diff(found.inliers.astype(int)) != 0))
-    if np.count_nonzero(np.diff(found.inliers.astype(int))) == 1:
+    changes = np.flatnonzero(np.diff(found.inliers.astype(int)))
+    if len(changes) == 1:
+        cut = int(changes[0])
         raise HandEyeRefused(
             Cause.MOVED,
             f"pairs 0 to {cut} agree among themselves, and so do pairs {cut + 1} to {len(P) - 1}, but not with each other",
             "the target, the camera or the arm's base was moved in between: calibrate from one part",
         )
+    others = rest[second.inliers]
+    listed = ", ".join(map(str, others[:8])) + (f" and {len(others) - 8} more" if len(others) > 8 else "")
     raise HandEyeRefused(
         Cause.TWO_BOARDS,
-        f"{int(found.inliers.sum())} pairs agree on one target pose, {int(second.inliers.sum())} others "
-        f"(pairs {listed(rest[second.inliers])}) on another",
+        f"{int(found.inliers.sum())} pairs agree on one target pose, {len(others)} others (pairs {listed}) on another",
         "two targets were seen, or one that looks the same when turned: use a target that is unique in every view",
     )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.hand_eye.closed_form import residuals
+from calibration.hand_eye.closed_form import consensus, residuals
 from tofcapture.poses import Float64, rotation_exp, transform
 
 FREEDOM = 8.0  # degrees of freedom of Student's t: efficient on Gaussian noise, and outliers lose their vote
@@ -24,31 +24,16 @@ SANDWICH = 12  # pairs from which on their own scatter is believed more than the
 
 @dataclass(frozen=True)
 class Refined:
-    """A refined solution.
+    """A refined solution of N pairs."""
 
-    Attributes
-    ----------
-    X, Z
-        (4, 4).
-    residual
-        (N, 6) metres and radians, camera frame.
-    weight
-        (N,) in (0, 1.75]; near 0 for outliers.
-    scatter
-        (N, 6, 6) covariance of each pair's noise.
-    covariance
-        (12, 12) of (t_X, phi_X, t_Z, phi_Z): metres, radians, rotations in the left tangent space.
-    left_out
-        (N, 6) residual of each pair under the solution without it; NaN where the rest determines nothing.
-    """
-
-    X: Float64
-    Z: Float64
-    residual: Float64
-    weight: Float64
-    scatter: Float64
+    X: Float64  #: (4, 4)
+    Z: Float64  #: (4, 4)
+    residual: Float64  #: (N, 6) metres and radians, camera frame
+    weight: Float64  #: (N,) in (0, 1.75]; near 0 for outliers
+    scatter: Float64  #: (N, 6, 6) covariance of each pair's noise
+    #: (12, 12) of (t_X, phi_X, t_Z, phi_Z): metres, radians, rotations in the left tangent space
     covariance: Float64
-    left_out: Float64
+    left_out: Float64  #: (N, 6) residual of each pair under the solution without it; NaN where the rest determines nothing
 
     @property
     def noise(self) -> tuple[float, float]:
@@ -92,10 +77,6 @@ def refine(
         Stretches of consecutive pairs that share their errors (streams); each pair is its own when None.
     eye_to_hand
         Where the flange is: P is T_flange_base, not T_base_flange.
-
-    Returns
-    -------
-    Refined
     """
     whole = np.repeat(np.square(np.maximum(noise, FLOOR)), 3)
     camera, arm = np.diag(whole / 2), whole / 2
@@ -145,8 +126,7 @@ def _sources(
 ) -> tuple[Float64, Float64]:
     """Share the residuals between camera and arm: one step of expectation-maximisation.
 
-    The camera's scatter is drawn towards isotropy; the arm's is isotropic in each half. Twelve parameters are two pairs' worth of
-    freedom.
+    The camera's scatter is drawn towards isotropy; the arm's is isotropic in each half. Twelve parameters cost two pairs.
     """
     n = len(r)
     root = np.sqrt(weight * n / max(n - 2, 1))[:, None] * np.einsum("nij,nj->ni", information, r)
@@ -161,7 +141,7 @@ def _sources(
 
 
 def jacobian(P: Float64, X: Float64, Z: Float64) -> Float64:
-    """Derivative (N, 6, 12) of :func:`hand_eye_closed.residuals` by (t_X, phi_X, t_Z, phi_Z)."""
+    """Derivative (N, 6, 12) of :func:`calibration.hand_eye.closed_form.residuals` by (t_X, phi_X, t_Z, phi_Z)."""
     back = X[:3, :3].T
     R_Pt = np.swapaxes(P[:, :3, :3], 1, 2)
     y = np.einsum("nij,nj->ni", R_Pt, Z[:3, 3] - P[:, :3, 3]) - X[:3, 3]
@@ -221,3 +201,9 @@ def _uncertainty(
         if np.linalg.cond(rest) < 1e14:
             left_out[i] = r[i] + J[i] @ np.linalg.solve(rest, score[i])
     return covariance, left_out
+
+
+def refined_from_consensus(P: Float64, B: Float64) -> Refined:
+    """Solve without any gate: the consensus start, refined; for searches that solve many times."""
+    start = consensus(P, B)
+    return refine(P, B, start.X, start.Z, start.noise)

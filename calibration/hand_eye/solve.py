@@ -2,7 +2,7 @@
 
 ``A_i`` is the hand in the base (T_base_flange), ``B_i`` the target in the camera (T_camera_target). Camera in the hand:
 ``A_i X B_i = Z`` with X = T_flange_camera and Z = T_base_target. Camera beside the arm: ``A_i^-1 X B_i = Z`` with
-X = T_base_camera and Z = T_flange_target. Closed forms start it, :mod:`calibration.hand_eye.refine` ends it.
+X = T_base_camera and Z = T_flange_target. A closed form starts it, :mod:`calibration.hand_eye.refine` ends it.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.hand_eye.checks import check_motion, check_numbers, check_pairing, clean
-from calibration.hand_eye.closed_form import daniilidis, distances, park_martin
-from calibration.hand_eye.consensus import consensus
+from calibration.hand_eye.closed_form import consensus, distances, park_martin
 from calibration.hand_eye.diagnosis import check_agreement, oriented, target_scale
-from calibration.hand_eye.refine import Refined, refine
+from calibration.hand_eye.refine import refine
 from tofcapture.poses import Float64
 
 OUTLIER = 6.0  # sigma (6-D): 1 of 200,000 Gaussian pairs lies farther out
@@ -28,48 +27,22 @@ SCALE_OFF = 0.005  # relative
 
 @dataclass(frozen=True)
 class HandEye:
-    """A hand-eye calibration.
+    """A hand-eye calibration of N pairs."""
 
-    Attributes
-    ----------
-    X
-        (4, 4) T_flange_camera, or T_base_camera when the camera stands beside the arm.
-    Z
-        (4, 4) T_base_target, or T_flange_target.
-    eye_to_hand
-        True when the camera stands beside the arm.
-    residual
-        (N, 6) metres and radians, camera frame: predicted minus seen target.
-    left_out
-        (N, 6) the same under the solution without that pair; NaN where undetermined.
-    outliers
-        (N,) bool, pairs that lost their vote.
-    noise
-        Standard deviation per axis of one pair: metres, radians.
-    covariance
-        (6, 6) of X: metres, then rotation vector in radians, left tangent space.
-    motion
-        RMS relative rotation of the hand about its three principal axes, radians, descending.
-    scale
-        Factor that fits the target's distances to the arm's, and its standard deviation; (1, small) is right.
-    closed_forms
-        X of each closed form, by name.
-    warnings
-        What a person should look at.
-    """
-
-    X: Float64
-    Z: Float64
-    eye_to_hand: bool
-    residual: Float64
-    left_out: Float64
-    outliers: NDArray[np.bool_]
-    noise: tuple[float, float]
-    covariance: Float64
+    X: Float64  #: (4, 4) T_flange_camera, or T_base_camera when the camera stands beside the arm
+    Z: Float64  #: (4, 4) T_base_target, or T_flange_target
+    eye_to_hand: bool  #: Whether the camera stands beside the arm
+    residual: Float64  #: (N, 6) metres and radians, camera frame: predicted minus seen target
+    left_out: Float64  #: (N, 6) the same under the solution without that pair; NaN where undetermined
+    outliers: NDArray[np.bool_]  #: (N,) pairs that lost their vote
+    noise: tuple[float, float]  #: Standard deviation per axis of one pair: metres, radians
+    covariance: Float64  #: (6, 6) of X: metres, then rotation vector in radians, left tangent space
+    #: RMS relative rotation of the hand about its three principal axes, radians, descending
     motion: tuple[float, float, float]
+    #: Factor that fits the target's distances to the arm's, and its standard deviation; (1, small) is right
     scale: tuple[float, float]
-    closed_forms: dict[str, Float64]
-    warnings: tuple[str, ...]
+    closed_forms: dict[str, Float64]  #: X of each closed form, by name
+    warnings: tuple[str, ...]  #: What a person should look at
 
     @property
     def sigma(self) -> tuple[float, float]:
@@ -103,10 +76,6 @@ def solve_hand_eye(
     blocks
         Stretches of consecutive pairs that share their errors, for the covariance of streams; None for single shots.
 
-    Returns
-    -------
-    HandEye
-
     Raises
     ------
     DataError
@@ -121,50 +90,31 @@ def solve_hand_eye(
     P = oriented(A, eye_to_hand=eye_to_hand)
     start = consensus(P, B)
     check_agreement(A, B, start, eye_to_hand=eye_to_hand)
-    refined = refine(P, B, start.X, start.Z, start.noise, blocks, eye_to_hand=eye_to_hand)
-    return _result(P, B, refined, start.X, motion, eye_to_hand=eye_to_hand)
-
-
-def _result(
-    P: Float64,
-    B: Float64,
-    refined: Refined,
-    kronecker: Float64,
-    motion: tuple[float, float, float],
-    *,
-    eye_to_hand: bool,
-) -> HandEye:
-    outliers = refined.distance > OUTLIER
-    kept = ~outliers
-    scale = target_scale(P[kept], B[kept], refined.X[:3, :3])
-    forms = {
-        "park-martin": park_martin(P[kept], B[kept]),
-        "dual quaternions": daniilidis(P[kept], B[kept]),
-        "kronecker": kronecker,
-    }
-    result = HandEye(
-        refined.X,
-        refined.Z,
+    found = refine(P, B, start.X, start.Z, start.noise, blocks, eye_to_hand=eye_to_hand)
+    outliers = found.distance > OUTLIER
+    scale = target_scale(P[~outliers], B[~outliers], found.X[:3, :3])
+    covariance = found.covariance[:6, :6]
+    return HandEye(
+        found.X,
+        found.Z,
         eye_to_hand,
-        refined.residual,
-        refined.left_out,
+        found.residual,
+        found.left_out,
         outliers,
-        refined.noise,
-        refined.covariance[:6, :6],
+        found.noise,
+        covariance,
         motion,
         scale,
-        forms,
-        (),
+        {"park-martin": park_martin(P[~outliers], B[~outliers]), "kronecker": start.X},
+        _warnings(B, outliers, np.diag(covariance), scale),
     )
-    return _with_warnings(result, B)
 
 
-def _with_warnings(result: HandEye, B: Float64) -> HandEye:
-    from dataclasses import replace
-
-    moved, turned = result.sigma
-    scale, off = result.scale
-    bad = np.flatnonzero(result.outliers)
+def _warnings(
+    B: Float64, outliers: NDArray[np.bool_], variances: Float64, scale: tuple[float, float]
+) -> tuple[str, ...]:
+    moved, turned = np.sqrt(variances[:3].sum()), np.sqrt(variances[3:].sum())
+    bad, factor, off = np.flatnonzero(outliers).tolist(), *scale
     behind = int((B[:, 2, 3] <= 0).sum())
     said = (
         (len(B) < FEW, f"only {len(B)} pairs: the error bars are themselves uncertain"),
@@ -172,23 +122,17 @@ def _with_warnings(result: HandEye, B: Float64) -> HandEye:
             moved > LOOSE[0] or turned > LOOSE[1],
             f"loosely determined: {1e3 * moved:.1f} mm, {np.degrees(turned):.2f} deg",
         ),
-        (len(bad) > 0, f"{len(bad)} pairs do not fit and lost their vote: {bad.tolist()}"),
+        (len(bad) > 0, f"{len(bad)} pairs do not fit and lost their vote: {bad}"),
         (
-            abs(scale - 1) > max(SCALE_OFF, 4 * off),
-            f"the target's distances fit best multiplied by {scale:.4f} +- {off:.4f}: check its size and the camera's focal length",
+            abs(factor - 1) > max(SCALE_OFF, 4 * off),
+            f"the target's distances fit best multiplied by {factor:.4f} +- {off:.4f}: check its size and the camera's focal length",
         ),
         (
             behind > len(B) / 2,
             f"the target lies behind the camera in {behind} pairs: columns swapped, or a camera frame whose z points back",
         ),
     )
-    return replace(result, warnings=tuple(text for says, text in said if says))
-
-
-def refine_from_consensus(P: Float64, B: Float64) -> Refined:
-    """Solve without any gate: the consensus start, refined; for searches that solve many times."""
-    start = consensus(P, B)
-    return refine(P, B, start.X, start.Z, start.noise)
+    return tuple(text for says, text in said if says)
 
 
 def to_dict(result: HandEye) -> dict[str, Any]:

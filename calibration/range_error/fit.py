@@ -1,9 +1,9 @@
 """The ToF camera's range error per frequency, fitted against the stereo surface jointly with the rig transform.
 
-Unknown are the terms of every frequency (:mod:`calibration.range_error.terms`), a twist of the rig transform with the prior that the
-alignment gives it, and per view and frequency a small error of its own, linear over the image: light that the surroundings throw
-back. The size of the latter is estimated from the views (expectation maximisation, as in :mod:`calibration.alignment.joint`), so that a
-spoilt frequency leans less on its views without being told.
+One linear least-squares problem over all views. Unknown are the terms of every frequency (:mod:`calibration.range_error.terms`), a
+twist of the rig transform with the prior that the alignment gives it, and per view and frequency a small error linear over the image:
+light that the surroundings throw back. The size of the latter is estimated from the views (expectation maximisation), so that a spoilt
+frequency leans less on its views without being told.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.range_error.solve import Found, Problem, solve
-from calibration.range_error.terms import MIN_GREY, MIN_KELVIN, ORDERS, Terms, greys, warmed
+from calibration.range_error.terms import IMAGE, ORDERS, Terms, jackknife, waves
 from calibration.range_error.views import RangeView, Seen, common_camera, range_view, wrapped
+from tofcapture.camera import Camera
 from tofcapture.errors import DataError, QualityError
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import frequencies, radius_px
@@ -27,6 +27,22 @@ MIN_VIEWS = 6
 LOOSE = np.array([0.005] * 3 + [0.005] * 3)  # m, rad: one sigma of a rig transform nobody vouches for
 FLOOR = 0.0005  # m; noise of a pixel that no burst shows: its own fixed offset, the stereo surface's ripple
 ROUNDS = (3, 8)  # of spreads and weights, one number per pass over the surface at the transform found before
+OWN = 3  # numbers of a view's own error: offset and slopes over the image
+START_SPREAD = 0.001  # m
+BELIEF = 3.0  # views that the first guess of the spread counts as
+TUKEY = 4.685
+MIN_KELVIN = 1.0  # K of spread between views below which temperature says nothing
+MIN_GREY = 0.35  # of ln A about its fall with range, below which amplitude and range are one
+# One sigma of what a maker's calibration may leave, or a camera without one may have. They only settle what the views do not.
+PRIOR_WAVE = 0.03  # rad; square waves and four taps make 0.071
+PRIOR_DARK = 0.003  # m at the median amplitude
+PRIOR = {
+    "offset": 0.3,
+    "scale": 0.01,
+    "radius": 3e-4,
+    "image": 0.005,
+    "temperature": 5e-4,
+}  # m, per px, per K
 
 
 @dataclass(frozen=True)
@@ -35,6 +51,8 @@ class RangeFit:
 
     Attributes
     ----------
+    camera
+        Of the ToF.
     errors
         One per frequency, ascending: the maker's and what was found, together.
     terms
@@ -44,13 +62,9 @@ class RangeFit:
     T_tof_stereo
         (4, 4), moved within its prior.
     moved
-        (6,) twist (rho, phi) about ``centre`` by which it moved, metres and radians.
-    centre
-        (3,) ToF frame, metres.
+        (6,) twist (rho, phi) about the centre by which it moved, metres and radians.
     spread
         (F,) one sigma of the views' own offsets, metres.
-    own
-        (V, F) the views' own offsets, metres.
     before, after, left_out
         Per view (F, N): error of the maker's calibration, of the fitted one, and of the one fitted to the other views, metres.
     views
@@ -59,15 +73,14 @@ class RangeFit:
         Why other views were not.
     """
 
+    camera: Camera
     errors: tuple[RangeError, ...]
     terms: tuple[Terms, ...]
     coefficients: tuple[Float64, ...]
     sigma: tuple[Float64, ...]
     T_tof_stereo: Float64
     moved: Float64
-    centre: Float64
     spread: Float64
-    own: Float64
     before: list[Float64]
     after: list[Float64]
     left_out: list[Float64]
@@ -109,19 +122,55 @@ def fit_ranges(
             f"ranges: expected at least {MIN_VIEWS} views, got {len(seen)}",
             hint="record the board every 10 cm from the nearest to the farthest range you need",
         )
-    info = common_camera(seen)
-    T = T_tof_stereo
+    info, T = common_camera(seen), T_tof_stereo
     if centre is None:
-        centre = np.mean([transform_points(T, s.points.mean(axis=0, dtype=np.float64)) for s in seen], axis=0)
+        centre = np.mean([transform_points(T, _middle_point(s)) for s in seen], axis=0)
     W, moved = transform(np.eye(3), centre), np.zeros(6)
     for rounds in ROUNDS:
         views, refused = _compared(seen, T, centre)
-        terms = _terms(info, views, tuple(orders))
+        terms = _terms(info, views, orders)
         problem = _problem(info, views, terms, np.asarray(transform_sigma, dtype=np.float64), moved)
-        found = solve(problem, rounds)
+        found = _solve(problem, rounds)
         moved = moved + found.x[:6]
         T = W @ exp(found.x[:6]) @ invert(W) @ T
-    return _fit(info, views, terms, problem, found, (T, moved, centre), refused)
+    parts = _parts(terms)
+    sigma = np.sqrt(np.diag(found.covariance))
+    return RangeFit(
+        camera=info.camera,
+        errors=tuple(
+            t.added(e, found.x[part]) for t, e, part in zip(terms, _makers(info), parts, strict=True)
+        ),
+        terms=terms,
+        coefficients=tuple(found.x[part] for part in parts),
+        sigma=tuple(sigma[part] for part in parts),
+        T_tof_stereo=T,
+        moved=moved,
+        spread=np.sqrt(found.variances[:, 0]),
+        before=[y - A[..., :6] @ found.x[:6] for y, A in zip(problem.y, problem.shared, strict=True)],
+        after=[y - A @ found.x for y, A in zip(problem.y, problem.shared, strict=True)],
+        left_out=[y - A @ x for y, A, x in zip(problem.y, problem.shared, found.left_out, strict=True)],
+        views=views,
+        refused=refused,
+    )
+
+
+def warmed(views: Sequence[RangeView]) -> float:
+    """Return the standard deviation of the views' temperatures, kelvin; 0 when the camera does not say."""
+    celsius = np.array([v.celsius for v in views])
+    return float(celsius.std()) if np.isfinite(celsius).all() else 0.0
+
+
+def greys(views: Sequence[RangeView], frequency: int) -> float:
+    """Return the spread of ln A about its fall with range: what tells a term of amplitude from one of range."""
+    level = np.concatenate([np.log(v.amplitude[frequency]) for v in views])
+    far = np.log(np.concatenate([v.true for v in views]))
+    fall = np.polyfit(far, level, 2)
+    return float(np.std(level - np.polyval(fall, far)))
+
+
+def _middle_point(seen: Seen) -> Float64:
+    points = seen.depth[::2, ::2, None] * seen.stereo.rays[::2, ::2]
+    return np.asarray(np.nanmean(points.reshape(-1, 3), axis=0), dtype=np.float64)
 
 
 def _compared(
@@ -142,63 +191,99 @@ def _compared(
     return views, refused
 
 
-def _terms(info: TofInfo, views: Sequence[RangeView], orders: tuple[int, ...]) -> tuple[Terms, ...]:
+def _makers(info: TofInfo) -> list[RangeError]:
+    """Range errors that the camera came with, one per frequency."""
     by_hz = {e.modulation_hz: e for e in info.range_errors}
+    return [by_hz.get(f, RangeError(f)) for f in frequencies(info.modulation_hz)]
+
+
+def _terms(info: TofInfo, views: Sequence[RangeView], orders: Sequence[int]) -> tuple[Terms, ...]:
+    names = ("offset", "scale", "radius", *IMAGE, *waves(orders))
+    warmth = ("temperature",) if warmed(views) >= MIN_KELVIN else ()
     return tuple(
         Terms(
-            camera=info.camera,
-            modulation_hz=f,
-            orders=orders,
-            warmth=warmed(views) >= MIN_KELVIN,
-            darkness=greys(views, i) >= MIN_GREY,
-            reference_celsius=by_hz.get(f, RangeError(f)).reference_celsius,
-            amplitude=float(np.median(np.concatenate([v.amplitude[i] for v in views]))),
+            maker.modulation_hz,
+            (*names, *warmth, *(("darkness",) if greys(views, i) >= MIN_GREY else ())),
+            maker.reference_celsius,
         )
-        for i, f in enumerate(frequencies(info.modulation_hz))
+        for i, maker in enumerate(_makers(info))
     )
+
+
+def _prior(terms: Terms, amplitude: float) -> Float64:
+    """One sigma of each coefficient; ``amplitude`` is the median, raw units."""
+    wave = PRIOR_WAVE * SPEED_OF_LIGHT / (4 * np.pi * terms.modulation_hz)
+    known = {**PRIOR, "cos": wave, "sin": wave, "darkness": PRIOR_DARK * amplitude}
+    return np.array([known[name.partition(" ")[0]] for name in terms.names])
+
+
+def _parts(terms: Sequence[Terms]) -> list[slice]:
+    """Where each frequency's coefficients stand among the shared unknowns, behind the transform's six."""
+    ends = np.cumsum([6, *[len(t.names) for t in terms]]).tolist()
+    return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Linear equations of every view."""
+
+    shared: list[Float64]  # (F, N, U) columns of the shared unknowns: twist, then terms
+    own: list[Float64]  # (N, OWN) columns of the view's own
+    y: list[Float64]  # (F, N) what is left to explain, metres
+    weight: list[Float64]  # (F, N), 1 / m^2
+    prior: Float64  # (U,) one sigma
+    expected: Float64  # (U,) before any view: what is left of the transform's prior after it was moved
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Solution of the equations."""
+
+    x: Float64  # (U,) shared unknowns
+    left_out: Float64  # (V, U) the same without each view
+    covariance: Float64  # (U, U)
+    variances: Float64  # (F, OWN) of the views' own errors
 
 
 def _problem(
     info: TofInfo, views: Sequence[RangeView], terms: Sequence[Terms], sigma: Float64, moved: Float64
-) -> Problem:
-    ends = np.cumsum([6, *[len(t.names) for t in terms]])
-    place = image_places(info.camera).reshape(-1, 2)
-    shared, own, y, weight = [], [], [], []
-    left = _left_by_factory(info, views, terms)
-    for view, rest in zip(views, left, strict=True):
-        A = np.zeros((len(terms), len(view.true), ends[-1]))
+) -> _Problem:
+    places, radii = image_places(info.camera).reshape(-1, 2), radius_px(info.camera).reshape(-1)
+    parts = _parts(terms)
+    shared, own, weight = [], [], []
+    for view in views:
+        A = np.zeros((len(terms), len(view.true), parts[-1].stop))
         A[:, :, :6] = view.lever
-        for i, t in enumerate(terms):
-            A[i, :, ends[i] : ends[i + 1]] = t.columns(view, i)
+        place, radius = places[view.pixels], radii[view.pixels]
+        for i, (t, part) in enumerate(zip(terms, parts, strict=True)):
+            A[i, :, part] = t.columns(view.true, radius, place, view.celsius, view.amplitude[i])
         shared.append(A)
-        own.append(np.c_[np.ones(len(view.true)), place[view.pixels]])
-        y.append(rest)
+        own.append(np.c_[np.ones(len(view.true)), place])
         weight.append(1 / (np.square(view.sigma) + FLOOR**2))
-    prior = np.concatenate([sigma, *[t.prior for t in terms]])
-    return Problem(shared, own, y, weight, prior, np.r_[-moved, np.zeros(len(prior) - 6)])
+    median = [float(np.median(np.concatenate([v.amplitude[i] for v in views]))) for i in range(len(terms))]
+    prior = np.concatenate([sigma, *map(_prior, terms, median)])
+    expected = np.r_[-moved, np.zeros(len(prior) - 6)]
+    return _Problem(shared, own, _left_by_maker(info, views), weight, prior, expected)
 
 
-def _left_by_factory(info: TofInfo, views: Sequence[RangeView], terms: Sequence[Terms]) -> list[Float64]:
+def _left_by_maker(info: TofInfo, views: Sequence[RangeView]) -> list[Float64]:
     """Measured minus true range minus the maker's error, (F, N) a view, its mean anywhere within the ambiguity."""
-    by_hz = {e.modulation_hz: e for e in info.range_errors}
     radius, place = radius_px(info.camera).reshape(-1), image_places(info.camera).reshape(-1, 2)
     out = [np.empty_like(v.measured) for v in views]
-    for i, t in enumerate(terms):
-        hz = t.modulation_hz
-        factory = by_hz.get(hz, RangeError(hz))
-        raw = []
+    for i, maker in enumerate(_makers(info)):
+        hz, raw = maker.modulation_hz, []
         for v in views:
-            celsius = v.celsius if np.isfinite(v.celsius) else factory.reference_celsius
+            celsius = v.celsius if np.isfinite(v.celsius) else maker.reference_celsius
             turned = 4 * np.pi * hz / SPEED_OF_LIGHT * v.true
-            known = factory.at(turned, radius[v.pixels], celsius, place[v.pixels], v.amplitude[i])
+            known = maker.at(turned, radius[v.pixels], celsius, place[v.pixels], v.amplitude[i])
             raw.append(v.measured[i] - v.true - known)
-        middle = _middle(np.concatenate(raw), hz)
+        middle = _circular_mean(np.concatenate(raw), hz)
         for own, r in zip(out, raw, strict=True):
             own[i] = middle + wrapped(r - middle, hz)
     return out
 
 
-def _middle(values: Float64, hz: float) -> float:
+def _circular_mean(values: Float64, hz: float) -> float:
     """Circular mean, metres; refuses values all round the circle."""
     turn = 4 * np.pi * hz / SPEED_OF_LIGHT
     z = np.exp(1j * turn * values).mean()
@@ -210,36 +295,56 @@ def _middle(values: Float64, hz: float) -> float:
     return float(np.angle(z) / turn)
 
 
-def _fit(
-    info: TofInfo,
-    views: list[RangeView],
-    terms: tuple[Terms, ...],
-    p: Problem,
-    found: Found,
-    placed: tuple[Float64, Float64, Float64],
-    refused: list[str],
-) -> RangeFit:
-    ends = np.cumsum([6, *[len(t.names) for t in terms]])
-    parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
-    by_hz = {e.modulation_hz: e for e in info.range_errors}
-    sigma = np.sqrt(np.diag(found.covariance))
+def _solve(p: _Problem, rounds: int) -> _Found:
+    """Solve for the shared unknowns, with so many rounds of spreads and robust weights."""
+    robust = [np.ones_like(y) for y in p.y]
+    variances: Float64 = np.full((len(p.y[0]), OWN), START_SPREAD**2)
+    for _ in range(rounds):
+        reduced = [_reduced(p, v, robust[v], variances) for v in range(len(p.y))]
+        H = sum(r[0] for r in reduced) + np.diag(p.prior**-2.0)
+        g = sum(r[1] for r in reduced) + p.expected / np.square(p.prior)
+        x = np.asarray(np.linalg.solve(H, g), dtype=np.float64)
+        own = [_own(p, v, robust[v], variances, x) for v in range(len(p.y))]
+        moments = np.stack([m for _, m in own])
+        variances = np.asarray(
+            (moments.sum(axis=0) + BELIEF * START_SPREAD**2) / (len(p.y) + BELIEF), dtype=np.float64
+        )
+        robust = [_tukey(p, v, x, b) for v, (b, _) in enumerate(own)]
+    left_out = np.stack([np.linalg.solve(H - h, g - b) for h, b in reduced])
+    covariance = np.linalg.inv(H)
+    believed = covariance @ np.diag(p.prior**-2.0) @ covariance
+    return _Found(x, left_out, jackknife(left_out)[1] + believed, variances)
 
-    return RangeFit(
-        errors=tuple(
-            t.added(by_hz.get(t.modulation_hz, RangeError(t.modulation_hz)), found.x[part])
-            for t, part in zip(terms, parts, strict=True)
-        ),
-        terms=terms,
-        coefficients=tuple(found.x[part] for part in parts),
-        sigma=tuple(sigma[part] for part in parts),
-        T_tof_stereo=placed[0],
-        moved=placed[1],
-        centre=placed[2],
-        spread=np.sqrt(found.variances[:, 0]),
-        own=found.own[..., 0],
-        before=[y - A[..., :6] @ found.x[:6] for y, A in zip(p.y, p.shared, strict=True)],
-        after=[y - A @ found.x for y, A in zip(p.y, p.shared, strict=True)],
-        left_out=[y - A @ x for y, A, x in zip(p.y, p.shared, found.left_out, strict=True)],
-        views=views,
-        refused=refused,
-    )
+
+def _reduced(p: _Problem, v: int, robust: Float64, variances: Float64) -> tuple[Float64, Float64]:
+    """Equations of the shared unknowns of one view, its own ones eliminated."""
+    U = len(p.prior)
+    H, g = np.zeros((U, U)), np.zeros(U)
+    B = p.own[v]
+    for i, (A, y) in enumerate(zip(p.shared[v], p.y[v], strict=True)):
+        w = robust[i] * p.weight[v][i]
+        AW, BW = A * w[:, None], B * w[:, None]
+        gain = (AW.T @ B) @ np.linalg.inv(BW.T @ B + np.diag(1 / variances[i]))
+        H += AW.T @ A - gain @ (BW.T @ A)
+        g += AW.T @ y - gain @ (BW.T @ y)
+    return H, g
+
+
+def _own(p: _Problem, v: int, robust: Float64, variances: Float64, x: Float64) -> tuple[Float64, Float64]:
+    """A view's own errors (F, OWN) and their second moments."""
+    out, moments = np.zeros_like(variances), np.zeros_like(variances)
+    B = p.own[v]
+    for i, (A, y) in enumerate(zip(p.shared[v], p.y[v], strict=True)):
+        BW = B * (robust[i] * p.weight[v][i])[:, None]
+        C = np.linalg.inv(BW.T @ B + np.diag(1 / variances[i]))
+        out[i] = C @ (BW.T @ (y - A @ x))
+        moments[i] = np.square(out[i]) + np.diag(C)
+    return out, moments
+
+
+def _tukey(p: _Problem, v: int, x: Float64, own: Float64) -> Float64:
+    left = p.y[v] - p.shared[v] @ x - own @ p.own[v].T
+    scaled = left * np.sqrt(p.weight[v])
+    scale = np.maximum(1.4826 * np.median(np.abs(scaled), axis=1, keepdims=True), 1.0)
+    out: Float64 = np.square(np.clip(1 - np.square(scaled / scale / TUKEY), 0, None))
+    return out

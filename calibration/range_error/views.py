@@ -8,15 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.range_error.surface import surface_at_pixels
-from calibration.registration.clouds import Mask, range_sigma
+from calibration.registration.clouds import TOF_MARGIN, Mask, dilate, plane_departure, range_sigma
+from tofcapture.camera import Camera
 from tofcapture.errors import DataError
 from tofcapture.frames import TofInfo, View
 from tofcapture.ops import phase
-from tofcapture.poses import Float64, transform_points
+from tofcapture.ops.normals import PlaneField
+from tofcapture.ops.project import project, triangulate
+from tofcapture.poses import Float64
 from tofcapture.rig import SPEED_OF_LIGHT
 
-STEREO_STRIDE = 2  # stereo points of every second row and column
+JUMP = 0.004  # m; departure of the surface from its neighbours that marks a depth edge
+WINDOW = 2.5  # px of the ToF image on either side whose stereo points make a pixel's plane
+BENT = 0.0015  # m; scatter of the stereo points about the plane of a pixel that sees more than one surface
+GRAZING = 0.5  # smallest cosine between ray and normal
 DARK = 0.010  # m; predicted noise of the high frequency beyond which a pixel says nothing
 THIN = 5  # of how many board pixels one serves where there are thousands: neighbours say the same
 FRONT = 0.1  # share of the image's middle that is nearer than what counts as the front
@@ -28,7 +33,7 @@ FEWEST_PIXELS = 150
 
 @dataclass(frozen=True)
 class Seen:
-    """A view without what is not needed of it.
+    """Keep of a view what its ranges are judged by.
 
     Attributes
     ----------
@@ -44,10 +49,10 @@ class Seen:
         (H, W) metres, noise of the high frequency's mean range.
     celsius
         Mean temperature; NaN when the camera does not say.
-    points
-        (M, 3) stereo frame, metres.
-    truth
-        (4, 4) ``T_tof_stereo`` of a simulated view, else None.
+    stereo
+        Intrinsics of the stereo grid.
+    depth
+        (SH, SW) stereo frame, metres; NaN where nothing was measured.
     """
 
     name: str
@@ -56,13 +61,13 @@ class Seen:
     saturated: Mask
     sigma: Float64
     celsius: float
-    points: NDArray[np.float32]
-    truth: Float64 | None
+    stereo: Camera
+    depth: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class RangeView:
-    """Measured and true ranges of one view's board pixels.
+    """Hold measured and true ranges of one view's N board pixels.
 
     Attributes
     ----------
@@ -95,9 +100,8 @@ class RangeView:
 
 
 def seen_of(view: View, name: str) -> Seen:
-    """Keep of a view what its ranges are judged by."""
+    """Reduce a view to what its ranges are judged by."""
     burst = view.tof
-    points = view.stereo.points[::STEREO_STRIDE, ::STEREO_STRIDE].reshape(-1, 3)
     celsius = burst.celsius[np.isfinite(burst.celsius)]
     return Seen(
         name=name,
@@ -106,9 +110,43 @@ def seen_of(view: View, name: str) -> Seen:
         saturated=np.asarray((burst.raw >= burst.info.saturation).any(axis=(0, 1))),
         sigma=range_sigma(burst),
         celsius=float(celsius.mean()) if len(celsius) else float("nan"),
-        points=points[np.isfinite(points).all(axis=1)],
-        truth=None if view.truth is None else view.truth.T_tof_stereo,
+        stereo=view.stereo.info.camera,
+        depth=np.ascontiguousarray(view.stereo.points[..., 2]),
     )
+
+
+def surface_at_pixels(seen: Seen, T_tof_stereo: Float64) -> tuple[Float64, Mask]:
+    """Fit the stereo surface where every ToF pixel's ray meets it, as ground truth does.
+
+    Parameters
+    ----------
+    seen
+        The view.
+    T_tof_stereo
+        (4, 4).
+
+    Returns
+    -------
+    planes
+        (H, W, 3) m with ``m . p = 1``, ToF frame, 1 / metres; NaN where there is no surface.
+    good
+        (H, W) one smooth surface that both cameras see, not at a grazing angle.
+    """
+    camera = seen.info.camera
+    sheet = triangulate(seen.depth, seen.stereo)
+    met = project(sheet, seen.stereo, T_tof_stereo, camera, 1)
+    field = PlaneField(np.where(sheet.vertex, sheet.depth, np.nan), seen.stereo)
+    radius = round(WINDOW * seen.stereo.fx / camera.fx)
+    planes, residual = field.at(met.pixels.reshape(-1, 2), [radius])
+    turned = planes @ T_tof_stereo[:3, :3].T
+    planes = (turned / (1 + turned @ T_tof_stereo[:3, 3])[:, None]).reshape(*camera.shape, 3)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        depth = 1 / (planes * camera.rays).sum(axis=-1)
+        cosine = 1 / (depth * camera.ray_lengths * np.linalg.norm(planes, axis=-1))
+        flat = residual.reshape(camera.shape) * np.square(depth) < BENT
+        departure = plane_departure(depth)
+    edge = dilate(np.isfinite(departure) & (departure > JUMP), TOF_MARGIN)
+    return planes, flat & ~edge & ~met.edge & (cosine > GRAZING) & (depth > 0)
 
 
 def range_view(seen: Seen, T_tof_stereo: Float64, centre: Float64) -> RangeView:
@@ -129,12 +167,11 @@ def range_view(seen: Seen, T_tof_stereo: Float64, centre: Float64) -> RangeView:
         When no surface fills the middle of the image.
     """
     info = seen.info
-    planes, good = surface_at_pixels(transform_points(T_tof_stereo, seen.points), info.camera)
+    planes, good = surface_at_pixels(seen, T_tof_stereo)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = 1 / (planes * info.camera.rays).sum(axis=-1)
     front = _front(good & ~seen.saturated & (seen.sigma < DARK), depth)
-    board = _coplanar(front, depth[..., None] * info.camera.rays)
-    pixels = np.flatnonzero(board)
+    pixels = np.flatnonzero(_coplanar(front, depth[..., None] * info.camera.rays))
     pixels = pixels[:: min(THIN, max(1, len(pixels) // PLENTY))]
     if len(pixels) < FEWEST_PIXELS:
         raise DataError(
@@ -144,7 +181,9 @@ def range_view(seen: Seen, T_tof_stereo: Float64, centre: Float64) -> RangeView:
     ray = (info.camera.rays / info.camera.ray_lengths[..., None]).reshape(-1, 3)[pixels]
     plane = planes.reshape(-1, 3)[pixels]
     radial = 1 / (plane * ray).sum(axis=1)
-    true, gain = _half_path(radial, ray, info.illuminator)
+    from_lamp = radial[:, None] * ray - info.illuminator
+    length = np.linalg.norm(from_lamp, axis=1)
+    gain = (1 + (ray * from_lamp).sum(axis=1) / length) / 2  # of half the path, per metre of radial distance
     moved = np.c_[plane, np.cross(radial[:, None] * ray - centre, plane)]
     amplitude = np.abs(seen.phasor).reshape(len(seen.phasor), -1)[:, pixels]
     hz = phase.frequencies(info.modulation_hz)
@@ -153,7 +192,7 @@ def range_view(seen: Seen, T_tof_stereo: Float64, centre: Float64) -> RangeView:
     return RangeView(
         name=seen.name,
         pixels=pixels,
-        true=true,
+        true=(radial + length) / 2,
         lever=moved * (gain * radial)[:, None],  # n / (n . u) = m r, as m . u r = 1
         measured=np.stack([phase.wrapped_range(z, f) for z, f in zip(flat, hz, strict=True)]),
         sigma=np.stack([noise * hz[-1] / f * amplitude[-1] / A for f, A in zip(hz, amplitude, strict=True)]),
@@ -163,7 +202,7 @@ def range_view(seen: Seen, T_tof_stereo: Float64, centre: Float64) -> RangeView:
 
 
 def _front(good: Mask, depth: Float64) -> NDArray[np.intp]:
-    """Label the pieces of ``good`` in front in the image's middle: from afar the table about the board is larger and reflects more light."""
+    """Label the pieces of ``good`` in front: from afar the table about the board is larger and reflects more light."""
     from scipy.ndimage import label, median
 
     pieces, count = label(good)
@@ -181,7 +220,7 @@ def _front(good: Mask, depth: Float64) -> NDArray[np.intp]:
 
 
 def _coplanar(pieces: NDArray[np.intp], points: Float64) -> Mask:
-    """Pieces in the plane of the largest one: a board is flat, and what shows through its holes or beside it is not of it."""
+    """Take the pieces in the plane of the largest one: what shows through a board's holes or beside it is not of it."""
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
     out: Mask = (pieces == sizes.argmax()) & (pieces > 0)
@@ -193,18 +232,12 @@ def _coplanar(pieces: NDArray[np.intp], points: Float64) -> Mask:
     return np.asarray(np.isin(pieces, near) & (off < 2 * FLAT))
 
 
-def _half_path(radial: Float64, ray: Float64, lamp: Float64) -> tuple[Float64, Float64]:
-    """Half the path lamp - surface - camera, and its derivative by the radial distance."""
-    way = radial[:, None] * ray - lamp
-    length = np.linalg.norm(way, axis=1)
-    return (radial + length) / 2, (1 + (ray * way).sum(axis=1) / length) / 2
-
-
 def common_camera(views: Sequence[Seen]) -> TofInfo:
     """Return the camera of all views; :class:`DataError` when they are of different ones."""
     first = views[0].info
     for view in views[1:]:
-        if (view.info.camera, view.info.modulation_hz, view.info.range_errors) != (
+        own = view.info
+        if (own.camera, own.modulation_hz, own.range_errors) != (
             first.camera,
             first.modulation_hz,
             first.range_errors,
@@ -217,7 +250,7 @@ def common_camera(views: Sequence[Seen]) -> TofInfo:
 
 
 def wrapped(difference: Float64, hz: float) -> Float64:
-    """Differences of ranges of a frequency, taken into half an ambiguity either side of zero."""
+    """Take differences of a frequency's ranges into half an ambiguity either side of zero."""
     R = SPEED_OF_LIGHT / (2 * hz)
     out: Float64 = np.mod(difference + R / 2, R) - R / 2
     return out

@@ -31,7 +31,8 @@ class Cloud:
     """Points with the directions along which they are held."""
 
     points: Float64  #: (N, 3) float64, metres, finite
-    #: (N, 3) float64, unit: of a surface, facing the camera at the origin of the points' frame; of a rim, across it
+    #: (N, 3) float64, unit: of a surface, facing the camera at the origin of the points' frame; of a
+    #: rim, across it
     normals: Float64
 
     def __len__(self) -> int:

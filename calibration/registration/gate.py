@@ -46,13 +46,16 @@ class Registration:
     inliers: int  #: Number of source points with a partner within ``INLIER_DISTANCE``
     rmse: float  #: Root mean square point-to-plane distance of the inliers, metres; NaN without inliers
     fitness: float  #: Inliers over source points
-    #: (6, 6) of (translation of ``centre``, rotation about it) in target axes, 1/m^2 and 1/rad^2: ``J^T J / rmse^2``. Its
-    #: inverse is the covariance that independent residuals would give; bias is not in it
+    #: (6, 6) of (translation of ``centre``, rotation about it) in target axes, 1/m^2 and 1/rad^2:
+    #: ``J^T J / rmse^2``. Its inverse is the covariance that independent residuals would give; bias is
+    #: not in it
     information: Float64
-    #: Condition number of ``J^T J`` with rotations measured as motion at the inliers' mean radius; infinite when singular
+    #: Condition number of ``J^T J`` with rotations measured as motion at the inliers' mean radius;
+    #: infinite when singular
     condition: float
     centre: Float64  #: (3,) centroid of the inliers, target frame, metres
-    #: (6,) Newton step that is left at this result: (translation of ``centre``, rotation vector), metres and radians
+    #: (6,) Newton step that is left at this result: (translation of ``centre``, rotation vector),
+    #: metres and radians
     step: Float64
 
 

@@ -24,7 +24,8 @@ class Pair:
     #: Path of the view inside the recording, and digest of the file
     name: str
     sha256: str
-    #: (N, 3) ToF points, ToF frame, metres: rims, each repeated ``REPEAT`` times as no library takes weights, then surface
+    #: (N, 3) ToF points, ToF frame, metres: rims, each repeated ``REPEAT`` times as no library takes
+    #: weights, then surface
     source: Float64
     target: Cloud  #: Rims and dense cloud of the stereo camera with normals, stereo frame
     rig: Rig  #: The rig as it was known when the view was taken

@@ -1,0 +1,431 @@
+"""``tofcapture calibrate lens | range | phase-order``: what the ToF camera itself does, found from recordings and raw frames."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tofcapture.cli import kit
+from tofcapture.command import Outcome
+from tofcapture.errors import DataError, FormatError, QualityError, UsageError
+from tofcapture.poses import Float64
+
+if TYPE_CHECKING:
+    from calibration.board.geometry import Board
+    from calibration.lens.fit import BoardLens, BoardSeen
+    from calibration.phase_order.find import PhaseOrder
+    from calibration.range_error.fit import RangeFit
+    from tofcapture.camera import Camera
+    from tofcapture.frames import View
+    from tofcapture.rig import Rig
+
+CARELESS = 3.0  # times: an averaged alignment's error is mostly the range error itself, which its scatter does not show
+BIN = 0.1  # m of range that one line of a report is about
+CELLS = 3  # the image is judged in so many columns and rows
+THROWN_BACK = 0.0015  # m of spread between views from which light from the surroundings is named
+
+
+def read_views(recording: Path, what: str) -> Iterator[tuple[Path, View]]:
+    """Read the calibration views of a recording one by one, with progress.
+
+    Raises
+    ------
+    DataError
+        No or unreadable views.
+    """
+    from calibration.registration.pairs import calibration_views
+    from tofcapture.files.view import read_view
+
+    paths = calibration_views(recording)
+    with kit.progress() as progress:
+        for i, path in enumerate(paths):
+            progress(what, i, len(paths))
+            yield path, read_view(path)
+        progress(what, len(paths), len(paths))
+
+
+def believed_rig(recording: Path, given: Path | None = None) -> Rig:
+    """Return the rig to start from: the given one, what was aligned or calibrated before, else what the first view says."""
+    from calibration.registration.pairs import calibration_views
+    from tofcapture.files.view import read_view
+    from tofcapture.rig import load_rig
+
+    path = given or recording / "rig.toml"
+    return load_rig(path) if given or path.exists() else read_view(calibration_views(recording)[0]).rig
+
+
+def saved(args: argparse.Namespace, name: str, data: dict[str, Any], rig: Rig, text: str) -> Outcome:
+    """Write a report and the rig it leads to into the recording, unless it is a dry run."""
+    from tofcapture.files.seal import write_text
+    from tofcapture.rig import dumps_rig
+
+    if not args.dry_run:
+        path = args.recording / "rig.toml"
+        write_text(args.recording / name, json.dumps(data, indent=1, allow_nan=False) + "\n")
+        write_text(path, dumps_rig(rig))
+        data = {**data, "rig": str(path)}
+    return Outcome(data=data, text=text)
+
+
+def configure_lens(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help="folder with calibration views")
+    parser.add_argument("--board", default="default", help="packaged board or a TOML file")
+    parser.add_argument("--dry-run", action="store_true", help="print the result, write nothing")
+
+
+def run_lens(args: argparse.Namespace) -> Outcome:
+    """Fit the lens, write it into ``rig.toml`` and ``lens.json``."""
+    from calibration.board.fit import Model
+    from calibration.board.geometry import load_board
+    from calibration.lens.fit import fit_lens
+
+    board, rig = load_board(args.board), believed_rig(args.recording)
+
+    def look(camera: Camera) -> tuple[list[BoardSeen], list[str]]:
+        found, refused = [], []
+        for path, view in read_views(args.recording, "board"):
+            try:
+                found.append(board_seen(view, camera, board))
+            except QualityError as err:
+                refused.append(f"{path.stem} {err}")
+        return found, refused
+
+    fit, refused = fit_lens(Model(board), look, rig.tof)
+    data = {**lens_report(fit, rig), "refused": refused}
+    return saved(args, "lens.json", data, replace(rig, tof=fit.camera), lens_table(data))
+
+
+def board_seen(view: View, camera: Camera, board: Board) -> BoardSeen:
+    """Find the board with the believed lens; keep its rims as pixels, which no lens has touched.
+
+    Raises
+    ------
+    QualityError
+        The board is not found.
+    """
+    from calibration.board.detector import NEAR_PLANE, detect, tof_sight
+    from calibration.lens.fit import BoardSeen
+
+    sight = tof_sight(replace(view.tof, info=replace(view.tof.info, camera=camera)))
+    T = detect(sight, board, camera).T_camera_board
+    height = (sight.rims - T[:3, 3]) @ T[:3, 2]
+    return BoardSeen(camera.project(sight.rims[np.abs(height) < NEAR_PLANE])[0], T)
+
+
+def lens_report(fit: BoardLens, rig: Rig) -> dict[str, Any]:
+    """Lay a fit out as JSON types."""
+    from calibration.lens.fit import NAMES, lens_values
+    from calibration.limits import LENS, worst
+
+    judged = {
+        "rms": fit.rms,
+        "left_out": float(np.sqrt(np.mean(np.square(fit.left_out)))),
+        "pixel_sigma": fit.pixel_sigma,
+        "coverage": float(fit.coverage.min()),
+    }
+    verdicts = {k: LENS[k].verdict(v) for k, v in judged.items()}
+    values = zip(NAMES, lens_values(fit.camera), fit.sigma, lens_values(rig.tof), strict=True)
+    return {
+        "format": "tofcapture-lens-calibration",
+        "version": 1,
+        "views": len(fit.left_out),
+        "model": fit.model,
+        "lens": {n: {"value": float(v), "sigma": float(s), "before": float(b)} for n, v, s, b in values},
+        **judged,
+        "left_out_px": fit.left_out.tolist(),
+        "growth_px": fit.growth,
+        "verdicts": verdicts,
+        "verdict": worst(list(verdicts.values())),
+        "look": [f"{k} {v}: {LENS[k].cause}" for k, v in verdicts.items() if v != "PASS"]
+        + ["the rig transform was aligned with the lens before: run tofcapture align again"],
+    }
+
+
+def lens_table(data: dict[str, Any]) -> str:
+    """Lay a report out for a person."""
+    lens = data["lens"]
+    held = data["model"] == "pinhole" and any(lens[k]["value"] for k in ("k1", "k2", "p1", "p2", "k3"))
+    model = "distortion as before" if held else data["model"]
+    rows = [
+        (name, f"{v['value']:.5g}", f"{v['sigma']:.2g}", f"{v['before']:.5g}")
+        for name, v in lens.items()
+        if v["sigma"] or v["value"]
+    ]
+    lines = [
+        f"{data['views']} views, {len(data['refused'])} refused; lens: {model}",
+        kit.table(("", "value", "+-", "before"), rows, "  "),
+        f"rims lie {data['rms']:.2f} px off the edges, {data['left_out']:.2f} at views left out",
+        f"a ray is known to {data['pixel_sigma']:.2f} px; {100 * data['coverage']:.0f} % of the image covered",
+        *data["refused"],
+        *(f"look: {t}" for t in data["look"]),
+        f"verdict: {data['verdict']}",
+    ]
+    return "\n".join(lines)
+
+
+def configure_range(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help="folder with calibration views")
+    parser.add_argument(
+        "--rig", type=Path, metavar="RIG.toml", help="rig transform to start from (default: the recording's)"
+    )
+    parser.add_argument("--orders", default="1,2,4", help="of the harmonics (default 1,2,4)")
+    parser.add_argument("--dry-run", action="store_true", help="print the result, write nothing")
+
+
+def run_range(args: argparse.Namespace) -> Outcome:
+    """Fit the range errors, write them into ``rig.toml`` and ``range.json``."""
+    from calibration.range_error.fit import fit_ranges
+    from calibration.range_error.views import seen_of
+
+    orders, rig = _orders(args.orders), believed_rig(args.recording, args.rig)
+    seen = [
+        seen_of(view, path.relative_to(args.recording).as_posix())
+        for path, view in read_views(args.recording, "reading")
+    ]
+    sigma, centre, known = _vouched(args.recording, rig)
+    fit = fit_ranges(seen, rig.T_tof_stereo, sigma, orders, centre)
+    data = range_report(fit, known)
+    found = replace(rig, T_tof_stereo=fit.T_tof_stereo, range_errors=fit.errors)
+    return saved(args, "range.json", data, found, range_table(data))
+
+
+def _orders(text: str) -> tuple[int, ...]:
+    try:
+        orders = tuple(sorted({int(m) for m in text.split(",")}))
+    except ValueError as err:
+        raise UsageError(f"--orders: expected whole numbers such as 1,2,4, got {text!r}") from err
+    if orders[0] < 1 or orders[-1] > 16:
+        raise UsageError(f"--orders: expected harmonics from 1 to 16, got {text!r}")
+    return orders
+
+
+def _vouched(recording: Path, rig: Rig) -> tuple[Float64, Float64 | None, str]:
+    """What the rig's transform is known to, about which point, and what vouches for it.
+
+    ``evidence.json`` vouches for the ``rig.toml`` it was written with; any other rig is known to millimetres only.
+    """
+    from calibration.range_error.fit import LOOSE
+
+    path = recording / "evidence.json"
+    evidence = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if not evidence or not np.allclose(evidence["T_tof_stereo"], rig.T_tof_stereo, atol=1e-9):
+        return LOOSE, None, "nothing"
+    centre = np.asarray(evidence["working_point_m"], dtype=np.float64)
+    if stated := evidence.get("sigma"):
+        sigma = np.r_[1e-3 * np.array(stated["translation_mm"]), np.radians(stated["rotation_deg"])]
+        return np.maximum(sigma, 1e-6), centre, "aligned"
+    error = evidence["standard_error"]
+    one = np.r_[[1e-3 * error["translation_mm"]] * 3, [np.radians(error["rotation_deg"])] * 3]
+    return np.maximum(CARELESS * one, 1e-6), centre, "averaged"
+
+
+def range_report(fit: RangeFit, transform_known: str) -> dict[str, Any]:
+    """Lay a fit out as JSON types.
+
+    Parameters
+    ----------
+    fit
+        The fit.
+    transform_known
+        What vouches for the rig transform: ``aligned``, ``averaged`` or ``nothing``.
+    """
+    from calibration.limits import worst
+
+    rows = [_frequency(fit, i) for i in range(len(fit.terms))]
+    far = np.concatenate([v.true for v in fit.views])
+    return {
+        "format": "tofcapture-range-calibration",
+        "version": 1,
+        "views": len(fit.views),
+        "covered_m": [float(np.quantile(far, 0.001)), float(np.quantile(far, 0.999))],
+        "transform": transform_known,
+        "transform_moved": {
+            "translation_mm": (1e3 * fit.moved[:3]).tolist(),
+            "rotation_deg": np.degrees(fit.moved[3:]).tolist(),
+        },
+        "frequencies": rows,
+        "verdict": worst([r["verdict"] for r in rows]),
+        "refused": fit.refused,
+        "look": _range_words(fit, far, transform_known),
+    }
+
+
+def _frequency(fit: RangeFit, i: int) -> dict[str, Any]:
+    from calibration.limits import RANGE_LEFT
+    from tofcapture.rig import range_error_table
+
+    terms = fit.terms[i]
+    left = 1e3 * _by_view_and_cell(fit, fit.left_out, i)
+    found = zip(terms.names, fit.coefficients[i], fit.sigma[i], strict=True)
+    return {
+        "modulation_hz": terms.modulation_hz,
+        "range_error": range_error_table(fit.errors[i]),
+        "found": {name: {"value": float(x), "sigma": float(s)} for name, x, s in found},
+        "before_mm": 1e3 * _by_view_and_cell(fit, fit.before, i),
+        "after_mm": 1e3 * _by_view_and_cell(fit, fit.after, i),
+        "left_out_mm": left,
+        "views_differ_mm": 1e3 * float(fit.spread[i]),
+        "by_range": _by_range(fit, i),
+        "verdict": RANGE_LEFT.verdict(left),
+    }
+
+
+def _by_view_and_cell(fit: RangeFit, left: list[Float64], i: int) -> float:
+    """RMS of medians over every view's part of each cell of the image, metres: noise is averaged away, nothing else."""
+    from tofcapture.rig import image_places
+
+    place = image_places(fit.camera).reshape(-1, 2)
+    medians = []
+    for view, rest in zip(fit.views, left, strict=True):
+        cell = np.minimum(((place[view.pixels] + 1) / 2 * CELLS).astype(int), CELLS - 1) @ [1, CELLS]
+        medians += [float(np.median(rest[i][cell == c])) for c in np.unique(cell) if (cell == c).sum() > 30]
+    return float(np.sqrt(np.mean(np.square(medians))))
+
+
+def _by_range(fit: RangeFit, i: int) -> list[dict[str, float]]:
+    far = np.concatenate([v.true for v in fit.views])
+    before, after = (np.concatenate([r[i] for r in left]) for left in (fit.before, fit.left_out))
+    own = np.floor(far / BIN).astype(np.intp)
+    return [
+        {
+            "from_m": float(k * BIN),
+            "pixels": int((own == k).sum()),
+            "before_mm": 1e3 * float(np.median(before[own == k])),
+            "left_out_mm": 1e3 * float(np.median(after[own == k])),
+        }
+        for k in np.unique(own)
+        if (own == k).sum() > 100
+    ]
+
+
+def _range_words(fit: RangeFit, far: Float64, transform_known: str) -> list[str]:
+    """What the views could not tell."""
+    from calibration.range_error.fit import MIN_GREY, MIN_KELVIN, greys, warmed
+
+    out = [
+        f"{terms.modulation_hz / 1e6:g} MHz: views of one range differ by {1e3 * spread:.1f} mm: the surroundings throw "
+        "light back on the board, which lengthens ranges; its mean is in the offset. Cover table and walls with dark cloth, "
+        "keep the board off them"
+        for terms, spread in zip(fit.terms, fit.spread, strict=True)
+        if spread > THROWN_BACK
+    ]
+    if transform_known == "nothing":
+        out.append(
+            "nobody vouches for the rig transform: the offset is known no better than the stereo camera's place along the optical axis. "
+            "Run tofcapture align RECORDING --method joint first"
+        )
+    filled = np.unique(np.floor(far / BIN).astype(int))
+    gaps = [k for k in range(filled.min(), filled.max()) if k not in filled]
+    if gaps:
+        out.append("no view covers " + ", ".join(f"{k * BIN:.1f} to {(k + 1) * BIN:.1f} m" for k in gaps))
+    if "temperature" not in fit.terms[0].names:
+        out.append(
+            f"temperature varied by {warmed(fit.views):.1f} K between views, expected {MIN_KELVIN:g}: the maker's coefficient is kept. "
+            "Record while the camera warms up to find it"
+        )
+    if "darkness" not in fit.terms[0].names:
+        out.append(
+            f"amplitude varied by a factor of {np.exp(greys(fit.views, 0)):.2f} at one range, expected {np.exp(MIN_GREY):.2f}: no term of "
+            "dark surfaces. Put patches of different greys on the board to find it"
+        )
+    return out
+
+
+def range_table(data: dict[str, Any]) -> str:
+    """Lay a report out for a person."""
+    near, far = data["covered_m"]
+    lines = [f"{data['views']} views, ranges from {near:.2f} to {far:.2f} m"]
+    for row in data["frequencies"]:
+        lines.append(
+            f"{row['modulation_hz'] / 1e6:g} MHz: {row['before_mm']:.2f} mm before, {row['after_mm']:.2f} after, "
+            f"{row['left_out_mm']:.2f} at views that were not fitted; views differ by {row['views_differ_mm']:.2f} mm  {row['verdict']}"
+        )
+        bins = [
+            (f"{b['from_m']:.1f}", f"{b['before_mm']:.2f}", f"{b['left_out_mm']:.2f}")
+            for b in row["by_range"]
+        ]
+        lines.append(kit.table(("from m", "before mm", "left mm"), bins, "  "))
+    moved = ", ".join(f"{t:.2f}" for t in data["transform_moved"]["translation_mm"])
+    turned = ", ".join(f"{r:.3f}" for r in data["transform_moved"]["rotation_deg"])
+    lines += [f"refused: {text}" for text in data["refused"]]
+    lines.append(f"rig transform moved by {moved} mm and {turned} deg")
+    return "\n".join([*lines, *(f"look: {text}" for text in data["look"]), f"verdict: {data['verdict']}"])
+
+
+def configure_phase_order(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        "raw",
+        type=Path,
+        metavar="RAW",
+        help="(frames, K, H, W) or (K, H, W), K = 4 per frequency: .npy, .npz, .h5, .raw, or a folder of images, one phase each",
+    )
+    parser.add_argument(
+        "--mhz", default="20,100", metavar="F[,F]", help="modulation frequencies in MHz (default 20,100)"
+    )
+    parser.add_argument(
+        "--reference",
+        type=Path,
+        metavar="RADIAL.npy",
+        help="(H, W) known distances along the rays, metres, NaN unknown",
+    )
+    parser.add_argument("--shape", metavar="H,W", help="image size of .raw files, rows of metadata included")
+    parser.add_argument("--out", type=Path, metavar="RESULT.json", help="write the result here")
+
+
+def run_phase_order(args: argparse.Namespace) -> Outcome:
+    """Find frequency, order, sign and start of the phases of raw frames."""
+    from calibration.phase_order.find import find_phase_order
+    from calibration.phase_order.raw_files import read_raw
+
+    try:
+        hz = [1e6 * float(f) for f in args.mhz.split(",")]
+    except ValueError as err:
+        raise UsageError(f"--mhz: expected numbers such as 20,100, got {args.mhz!r}") from err
+    reference = None if args.reference is None else _array(args.reference)
+    order = find_phase_order(read_raw(args.raw, 4 * len(hz), _size(args.shape)), hz, reference)
+    data = {"format": "tofcapture-phase-order", "version": 1, **asdict(order)}
+    data["offset_rad"] = [None if np.isnan(x) else x for x in order.offset_rad]  # NaN is not JSON
+    return kit.written(data, _order_table(order), args.out)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    try:
+        height, width = (int(n) for n in text.split(","))
+    except ValueError as err:
+        raise UsageError(f"--shape: expected H,W such as 180,240, got {text!r}") from err
+    return height, width
+
+
+def _order_table(order: PhaseOrder) -> str:
+    channels = enumerate(zip(order.modulation_hz, order.phase_rad, strict=True))
+    rows = [(k, f"{f / 1e6:g}", f"{np.degrees(p):.0f}") for k, (f, p) in channels]
+    lines = [
+        kit.table(("channel", "MHz", "phase deg"), rows),
+        f"sign from {order.sign_from}, confidence {order.confidence:.2f}",
+        f"second harmonic {order.second_harmonic:.3f}, concentration {order.concentration:.3f}",
+    ]
+    if not order.start_known:
+        lines.append(
+            "look: the start tap is assumed; ranges hold up to a quarter period, pass --reference to settle it"
+        )
+    return "\n".join(lines)
+
+
+def _array(path: Path) -> Any:
+    try:
+        return np.load(path, allow_pickle=False)
+    except FileNotFoundError as err:
+        raise DataError(f"{path}: no such file") from err
+    except (ValueError, EOFError, OSError) as err:
+        raise FormatError(f"{path}: expected an array in .npy format, got {err}") from err
