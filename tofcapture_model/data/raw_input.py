@@ -229,10 +229,9 @@ def _check_unit(raw: NDArray[Any], saturation: float, path: Path) -> str:
 def check_taps(raw: NDArray[np.float64], info: TofInfo, path: Path, which: str = "") -> None:
     """Refuse taps (8, H, W) that cannot be what ``info`` says: other units, other channels, no signal.
 
-    Taps half a period apart add up to twice the offset, so ``C_0 - C_1 + C_2 - C_3`` vanishes for the right order. Ranges of
-    both frequencies agree up to noise and calibration; depths lie within the reach of the rig. Looked at are the brighter half
-    of the pixels below saturation, and the bounds are wide. A start tap that is wrong by the same quarter in both frequencies
-    passes: no frame can tell. ``path`` and ``which`` name file and frame.
+    ``C_0 - C_1 + C_2 - C_3`` vanishes for the right order; ranges of both frequencies agree up to noise and calibration; depths
+    lie within the reach of the rig. Looked at are the brighter half of the pixels below saturation, and the bounds are wide. A
+    start tap that is wrong by the same quarter in both frequencies passes: no frame can tell. ``path`` and ``which`` are names.
 
     Raises
     ------

@@ -232,9 +232,8 @@ def doubled(image: Tensor) -> Tensor:
 class Refinement(nn.Module):
     """Depth to normals to depth, a few rounds with learned gains (paper section IV-C, after GeoNet).
 
-    The geometry has no parameters. Gains start at one: what it says is taken whole, until training knows better. A bad normal
-    map can make depth worse, so only neighbours whose normals agree and whose votes lie near are asked, and trusted by the
-    inverse square of their expected error.
+    The geometry has no parameters. Gains start at one: what it says is taken whole, until training knows better. Only neighbours
+    whose normals agree and whose votes lie near are asked, and trusted by the inverse square of their expected error.
     """
 
     def __init__(self, iterations: int, radius: int) -> None:

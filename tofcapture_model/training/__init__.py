@@ -27,7 +27,7 @@ from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Config, Stage, dumps_config
 from tofcapture_model.data import FrameDataset, collate, epoch_batches
 from tofcapture_model.evaluation.evaluate import model_method, score
-from tofcapture_model.frame import Frame, Target
+from tofcapture_model.frame import Frame, Target, frame_to, target_to
 from tofcapture_model.losses import Objective
 from tofcapture_model.networks import Model
 from tofcapture_model.networks.checkpoint import (
@@ -212,7 +212,7 @@ class Run:
         self._log.close()
 
     def batches(self, data: FrameDataset, stage: Stage, workers: int) -> Iterator[tuple[Frame, Target]]:
-        """Yield the batches of the stage that the run is in, from where it is to its end; validates after epochs."""
+        """Yield the stage's batches, on the device, from where the run is to its end; validates after epochs."""
         position, training, budget = self.position, self.config.training, self.budget(stage)
         self._started, self._saved = time.monotonic() - position.elapsed, time.monotonic()
         while not self._done(stage):
@@ -220,11 +220,13 @@ class Run:
                 len(data), training.batch, training.seed, position.epoch, self.group.rank, self.group.world
             )
             left = keys[position.batch :]
-            for batch in DataLoader(data, batch_sampler=left, num_workers=workers, collate_fn=collate):
+            for frame, target in DataLoader(
+                data, batch_sampler=left, num_workers=workers, collate_fn=collate
+            ):
                 steps = position.epoch * len(keys) + position.batch, stage.epochs * len(keys)
                 self._told = (position.elapsed, budget) if budget else steps
                 self.progress = min(self._told[0] / self._told[1], 1.0)
-                yield batch
+                yield frame_to(frame, self.group.device), target_to(target, self.group.device)
                 if budget is not None and position.elapsed >= budget:
                     break
             position.epoch, position.batch = position.epoch + 1, 0

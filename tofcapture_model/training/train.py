@@ -15,11 +15,11 @@ from torch import nn
 
 from tofcapture.cli.kit import Report
 from tofcapture.files.manifest import load_manifest
-from tofcapture_model.config import Config, Stage, Training
+from tofcapture_model.config import Config, Stage
 from tofcapture_model.data import FrameDataset, spare_memory
 from tofcapture_model.data.augment import BurstNoise, redraw_calibration, redraw_frame
 from tofcapture_model.evaluation.evaluate import calibrate
-from tofcapture_model.frame import Estimate, Frame, frame_to, target_to
+from tofcapture_model.frame import Estimate, Frame
 from tofcapture_model.losses import Objective
 from tofcapture_model.networks import Model, build_model, compile_unets, select_stage, training_loss
 from tofcapture_model.networks.checkpoint import save_model
@@ -54,8 +54,8 @@ def train(
     ----------
     config
         Network, losses, stages.
-    dataset
-        Folder with ``manifest.json``.
+    dataset, also
+        Folders with ``manifest.json``: the first, which also validates, and further ones to learn from.
     out
         Folder of the run: ``model.safetensors``, ``model.toml``, ``resume.safetensors``, ``metrics.jsonl``, TensorBoard events.
     epochs
@@ -72,8 +72,6 @@ def train(
         Folder that ``tofcapture pack`` filled with the ``train`` split; ``None`` reads the shards.
     start
         Checkpoint to start from instead of random weights (fine-tuning); its network must be the configuration's.
-    also
-        Further datasets whose ``train`` splits are learned from; validation stays with the first.
     report
         Called with the stage, what is done of it, all of it, and one line of text.
 
@@ -98,19 +96,21 @@ def train(
             return run.ended()
         if config.training.compile:
             compile_unets(model, group.device)
-        data = _training_data(config.training, datasets, cache, workers)
+        training = config.training
+        data = FrameDataset(
+            datasets, "train", training.crop, flip=training.flip, seed=training.seed, frames=training.frames,
+            mean=training.noise == "drawn", cache_bytes=0 if workers else spare_memory(), cache=cache,
+        )  # fmt: skip
         with closing(data), run:
             for stage in config.stages[run.position.stage :]:
                 learner = Learner(model, config, stage, group, run.moments)
                 for frame, target in run.batches(data, stage, workers):
-                    frame = frame_to(frame, group.device)  # noqa: PLW2901  on its way
-                    target = target_to(target, group.device)  # noqa: PLW2901
-                    frame = learner.augmented(frame, data.burst, run.position)  # noqa: PLW2901
-                    estimate = learner.forward(frame)
-                    loss = training_loss(model, config.losses, stage.name, estimate, target, frame)
+                    seen = learner.augmented(frame, data.burst, run.position)
+                    estimate = learner.forward(seen)
+                    loss = training_loss(model, config.losses, stage.name, estimate, target, seen)
                     run.expect_finite("loss", float(loss.total.detach()))
                     run.expect_finite("gradient", learner.backward(loss))
-                    rate = scheduled_rate(stage, config.training.schedule, run.progress)
+                    rate = scheduled_rate(stage, training.schedule, run.progress)
                     learner.step(rate)
                     run.stepped(stage, loss, rate)
                     stop = stop_after is not None and run.position.step >= stop_after
@@ -183,22 +183,6 @@ def scheduled_rate(stage: Stage, schedule: str, progress: float) -> float:
         return stage.learning_rate
     cosine = max(0.5 * (1 + math.cos(math.pi * progress)), 1e-3)
     return stage.learning_rate * min(1.0, 0.1 + progress / WARM_UP) * cosine
-
-
-def _training_data(
-    training: Training, datasets: Sequence[Path], cache: Path | None, workers: int
-) -> FrameDataset:
-    return FrameDataset(
-        datasets,
-        "train",
-        training.crop,
-        flip=training.flip,
-        seed=training.seed,
-        frames=training.frames,
-        mean=training.noise == "drawn",
-        cache_bytes=0 if workers else spare_memory(),
-        cache=cache,
-    )
 
 
 def _finish(run: Run, source: Mapping[str, Any]) -> None:
