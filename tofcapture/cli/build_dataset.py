@@ -49,9 +49,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     )
     batch = parser.add_mutually_exclusive_group()
     batch.add_argument(
-        "--part",
-        metavar="I/N",
-        help="build only part I of N of the scenes; the last part to be done finishes the dataset",
+        "--part", metavar="I/N", help="build part I of N of the scenes; the last to end finishes the dataset"
     )
     batch.add_argument(
         "--finish",
