@@ -7,7 +7,7 @@ import sqlite3
 import pytest
 
 from tests.test_recorder import VIEWS, Bench, _arrays, _few_candidates, _record, rows
-from tofcapture.errors import BusyError, DeviceError
+from tofcapture.errors import BusyError, DataError, DeviceError
 from tofcapture.frames import ArmInfo
 from tofcapture.record import recorder, resources
 from tofcapture.record.journal import Journal, journal_path
@@ -144,6 +144,20 @@ def test_what_is_set_aside_stays(tmp_path):
         assert _record(tmp_path).recorded == (1,)
     kept = sorted(path.read_bytes() for path in view.parent.glob("*.damaged*"))
     assert kept == [b"first", b"second"]
+
+
+def test_what_cannot_be_read_is_not_damaged(tmp_path):
+    """A view that cannot be read just now is named, and stays under its name."""
+    _record(tmp_path)
+    view = tmp_path / "views" / "mug" / "view-001.h5"
+    view.unlink()
+    view.mkdir()  # root reads everything but this
+    for path in tmp_path.glob("journal.sqlite*"):
+        path.unlink()
+    with pytest.raises(DataError, match="cannot be read"):
+        _record(tmp_path)
+    assert view.is_dir()
+    assert not list(view.parent.glob("*.damaged*"))
 
 
 def test_a_real_arm_has_one_master(tmp_path, monkeypatch):

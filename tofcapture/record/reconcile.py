@@ -45,10 +45,13 @@ def reconcile(journal: Journal, recording: Path, scene: str) -> list[str]:
 
 def _adopt(journal: Journal, path: Path, scene: str, index: int) -> str:
     """Take a whole file that the journal does not know, or set it aside; say which."""
+    sha256 = ""
     try:
         sha256 = sealed_digest(path)
         view = read_view(path)
     except DataError as err:
+        if not sha256 and isinstance(err.__cause__, OSError):
+            raise  # its bytes cannot be read just now: that is no damage
         return f"{path}: set aside as {_set_aside(path).name}: {err.message}"
     if (view.scene, view.index) != (scene, index):
         return f"{path}: set aside as {_set_aside(path).name}: it is view {view.index} of {view.scene!r}"
