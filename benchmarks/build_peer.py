@@ -14,7 +14,7 @@ import numpy as np
 from tofcapture.camera import Camera
 from tofcapture.files.view import read_view
 from tofcapture.frames import View
-from tofcapture.o3d import load_open3d
+from tofcapture.libraries import load_open3d
 from tofcapture.ops.phase import Decoder
 from tofcapture.rig import Rig
 

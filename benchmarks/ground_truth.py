@@ -30,8 +30,8 @@ from tofcapture.devices.sim.world import SimWorld
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.shard import GroundTruth
 from tofcapture.frames import ArmState, Truth, View
+from tofcapture.libraries import load_open3d
 from tofcapture.meshes import Mesh, cuboid, move
-from tofcapture.o3d import load_open3d
 from tofcapture.ops.denoise import denoise
 from tofcapture.poses import exp, invert, look_at, transform
 

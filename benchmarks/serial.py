@@ -15,8 +15,16 @@ import zlib
 import numpy as np
 
 from tofcapture.devices.tof_serial.messages import DATA
-from tofcapture.devices.tof_serial.packet import Kind, Packet, Parser, encode
-from tofcapture.devices.tof_serial.pixels import Assembly, pack12, values, whiten
+from tofcapture.devices.tof_serial.packet import (
+    Assembly,
+    Kind,
+    Packet,
+    Parser,
+    encode,
+    pack12,
+    values,
+    whiten,
+)
 
 READ = 65536  # bytes that one read of the port brings
 SHAPE = (8, 180, 240)

@@ -14,7 +14,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from tofcapture.cli import GROUP, ORDER
-from tofcapture.command import Command
+from tofcapture.cli.kit import Command
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("tofcapture", "calibration", "tofcapture_model")

@@ -37,7 +37,7 @@ from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, QualityError
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth, View
-from tofcapture.o3d import load_open3d
+from tofcapture.libraries import load_open3d
 from tofcapture.ops import phase
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError, Rig, load_rig
 

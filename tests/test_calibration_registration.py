@@ -12,7 +12,7 @@ from calibration.registration.clouds import Cloud
 from calibration.registration.gate import Refusal, check_registration, measure_registration
 from tofcapture import poses
 from tofcapture.errors import ConfigError, DataError
-from tofcapture.o3d import load_open3d
+from tofcapture.libraries import load_open3d
 
 TRUE = poses.transform(poses.rotation_exp([0.02, -0.05, 0.01]), [0.1, 0.01, -0.02])
 GUESS = poses.exp([0.008, -0.006, 0.01, 0.01, -0.015, 0.012]) @ TRUE

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tofcapture.cli import GROUP, main, parser
-from tofcapture.command import Command
+from tofcapture.cli.kit import Command
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = {e.name: e.load() for e in entry_points(group=GROUP)}

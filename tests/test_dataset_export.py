@@ -18,7 +18,7 @@ from tofcapture.dataset.export import UNIT, export
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.png import png_bytes
 from tofcapture.files.shard import ShardReader
-from tofcapture.o3d import load_open3d
+from tofcapture.libraries import load_open3d
 
 
 @pytest.fixture(scope="module")

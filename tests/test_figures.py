@@ -18,9 +18,9 @@ from tofcapture.files.shard import GroundTruth
 from tofcapture.files.view import view_path, write_view
 from tofcapture.poses import look_at
 from tofcapture.rig import dumps_rig
-from tofcapture.viz.clouds import eye_for, splat
 from tofcapture.viz.figures.preprocessing import gap, preprocess
 from tofcapture.viz.figures.scenes import Maps, read_rows
+from tofcapture.viz.shots import eye_for, splat
 
 pytest.importorskip("matplotlib")
 

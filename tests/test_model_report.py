@@ -31,9 +31,8 @@ from tofcapture_model.config import preset
 from tofcapture_model.networks import build_model
 from tofcapture_model.networks.checkpoint import save_model
 from tofcapture_model.report import write_report
-from tofcapture_model.report.content import loss_curve, origin_of
+from tofcapture_model.report.content import POOLS, headline, loss_curve, origin_of, tables, tiles
 from tofcapture_model.report.examples import choose
-from tofcapture_model.report.scores import POOLS, headline, tables, tiles
 from tofcapture_model.training import read_metrics
 
 CAMERA = Camera(64, 48, 50.0, 52.0, 31.0, 24.5)

@@ -193,7 +193,7 @@ def test_the_back_of_a_sheet_is_no_surface():
 
 def test_open3d_agrees():
     """On a bumpy sheet open3d's ray caster meets the same surface at the same depth."""
-    o3d = pytest.importorskip("tofcapture.o3d").load_open3d()
+    o3d = pytest.importorskip("tofcapture.libraries").load_open3d()
     v, u = np.mgrid[0 : STEREO.height, 0 : STEREO.width]
     depth = 0.8 + 0.03 * np.sin(u / 17) * np.cos(v / 13)
     points = transform_points(T, STEREO.unproject(depth))

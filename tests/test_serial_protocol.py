@@ -18,8 +18,18 @@ from tests.tof_module.vectors import vectors
 from tofcapture.devices.tof_serial import messages
 from tofcapture.devices.tof_serial.clock import Anchor, ClockError, anchor, burst_times, drift, to_host
 from tofcapture.devices.tof_serial.messages import MalformedError
-from tofcapture.devices.tof_serial.packet import Kind, Packet, Parser, decode, encode
-from tofcapture.devices.tof_serial.pixels import Assembly, pack12, packed_size, unpack12, values
+from tofcapture.devices.tof_serial.packet import (
+    Assembly,
+    Kind,
+    Packet,
+    Parser,
+    decode,
+    encode,
+    pack12,
+    packed_size,
+    unpack12,
+    values,
+)
 
 VECTORS = Path(__file__).resolve().parents[1] / "docs" / "serial-vectors.json"
 mostly_zero = st.lists(st.sampled_from([0, 0, 1, 255]), max_size=700).map(bytes)

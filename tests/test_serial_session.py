@@ -9,8 +9,7 @@ from tests.tof_module.core import ModuleCore
 from tests.tof_module.module import Noise
 from tests.tof_module.synthetic import simulated_info, synthetic
 from tofcapture.devices.tof_serial.messages import Capture, Frame, Info, Time
-from tofcapture.devices.tof_serial.packet import Kind, Packet, Parser, encode
-from tofcapture.devices.tof_serial.pixels import values
+from tofcapture.devices.tof_serial.packet import Kind, Packet, Parser, encode, values
 from tofcapture.devices.tof_serial.session import (
     MS,
     FirmwareError,

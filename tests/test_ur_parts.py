@@ -20,10 +20,10 @@ from tofcapture.devices import faults
 from tofcapture.devices.clearance import body_points, stage_of
 from tofcapture.devices.kinematics import HOME
 from tofcapture.devices.station import DEFAULT, open_station
+from tofcapture.devices.ur_rtde import link as wire
 from tofcapture.devices.ur_rtde import probe as probing
-from tofcapture.devices.ur_rtde import wire
 from tofcapture.devices.ur_rtde.limits import check_goal, check_way, read_settings
-from tofcapture.devices.ur_rtde.wire import danger, halted
+from tofcapture.devices.ur_rtde.link import danger, halted
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 
 SETTINGS = read_settings({"host": "127.0.0.1"})

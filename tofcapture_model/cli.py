@@ -12,8 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tofcapture.cli.kit import progress
-from tofcapture.command import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome, progress
 from tofcapture.errors import ConfigError, TofError
 from tofcapture_model.config import Config, load_config, preset, presets
 from tofcapture_model.evaluation.tables import SUITES

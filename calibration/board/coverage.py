@@ -14,7 +14,7 @@ from calibration.board.geometry import inside, load_board
 from calibration.limits import LIMITS
 from calibration.registration.pairs import calibration_views
 from tofcapture.camera import Camera
-from tofcapture.command import Outcome
+from tofcapture.cli.kit import Outcome
 from tofcapture.devices.clearance import stage_of
 from tofcapture.errors import DataError
 from tofcapture.files.view import read_view

@@ -11,7 +11,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from calibration.board.geometry import Board, load_board, symmetries
-from tofcapture.command import Outcome
+from tofcapture.cli.kit import Outcome
 from tofcapture.errors import ConfigError
 from tofcapture.files.seal import replacing
 from tofcapture.meshes import extrude, signed_area

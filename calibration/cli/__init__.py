@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from importlib import import_module
 
-from tofcapture.command import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome
 
 # Where each part's ``configure_*`` and ``run_*`` are, and what it does.
 _PARTS = {

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tofcapture.cli import kit
-from tofcapture.command import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome
 from tofcapture.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.cli.sensor import believed_rig, read_views, saved
 from tofcapture.cli import kit
-from tofcapture.command import Outcome
+from tofcapture.cli.kit import Outcome
 from tofcapture.errors import DataError, QualityError, UsageError
 from tofcapture.poses import Float64, invert, rotation_log
 

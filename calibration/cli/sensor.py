@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tofcapture.cli import kit
-from tofcapture.command import Outcome
+from tofcapture.cli.kit import Outcome
 from tofcapture.errors import DataError, FormatError, QualityError, UsageError
 from tofcapture.poses import Float64
 

@@ -15,7 +15,7 @@ import numpy as np
 from calibration.registration.clouds import Cloud
 from calibration.registration.gate import Registration, check_clouds, measure_registration
 from tofcapture.errors import ConfigError
-from tofcapture.o3d import load_open3d
+from tofcapture.libraries import load_open3d
 from tofcapture.poses import Float64
 
 COARSE_TO_FINE = (0.080, 0.040, 0.020, 0.010)  # m, correspondence distances

@@ -25,8 +25,7 @@ from tofcapture.devices.tof_serial.messages import (
     Refused,
     Time,
 )
-from tofcapture.devices.tof_serial.packet import PROTOCOL, Kind, Packet, Parser, encode
-from tofcapture.devices.tof_serial.pixels import pack12
+from tofcapture.devices.tof_serial.packet import PROTOCOL, Kind, Packet, Parser, encode, pack12
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.devices.tof_serial.messages import Info
-from tofcapture.devices.tof_serial.pixels import whiten
+from tofcapture.devices.tof_serial.packet import whiten
 from tofcapture.rig import SPEED_OF_LIGHT
 
 Source = Callable[[int, int], tuple[NDArray[np.uint16], float]]

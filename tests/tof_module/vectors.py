@@ -22,8 +22,7 @@ from tofcapture.devices.tof_serial.messages import (
     Refused,
     Time,
 )
-from tofcapture.devices.tof_serial.packet import Kind, Packet, encode
-from tofcapture.devices.tof_serial.pixels import pack12
+from tofcapture.devices.tof_serial.packet import Kind, Packet, encode, pack12
 
 
 def _cobs() -> list[dict[str, str]]:

@@ -11,7 +11,7 @@ import numpy as np
 from tests.ur_emulator.faults import Faults
 from tests.ur_emulator.motion import Motion
 from tofcapture.devices.kinematics import HOME, arm_model, forward
-from tofcapture.devices.ur_rtde.wire import Value
+from tofcapture.devices.ur_rtde.link import Value
 from tofcapture.poses import rotation_log
 
 STOPPED, PLAYING, PAUSED = 1, 2, 4  # runtime_state

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 from tests.ur_emulator.outputs import TYPES, input_type
 from tests.ur_emulator.robot import Robot
-from tofcapture.devices.ur_rtde import wire
+from tofcapture.devices.ur_rtde import link as wire
 from tofcapture.errors import DeviceError
 
 _POLYSCOPE = (5, 11, 1, 108318)

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 
 from tofcapture import __version__
-from tofcapture.command import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome
 from tofcapture.errors import ConfigError, TofError, UsageError
 
 GROUP = "tofcapture.commands"
@@ -49,7 +49,7 @@ def _load(entry: EntryPoint) -> Command:
     command = entry.load()
     if not isinstance(command, Command):
         raise ConfigError(
-            f"{entry.value}: expected a tofcapture.command.Command, got {type(command).__name__}"
+            f"{entry.value}: expected a tofcapture.cli.kit.Command, got {type(command).__name__}"
         )
     return command
 

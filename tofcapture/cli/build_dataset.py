@@ -7,8 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tofcapture.cli.kit import progress
-from tofcapture.command import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome, progress
 from tofcapture.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from tofcapture.cli.kit import Command, Outcome
 from tofcapture.cli.setup import station_path
-from tofcapture.command import Command, Outcome
 from tofcapture.errors import ConfigError
 
 

@@ -6,8 +6,7 @@ import argparse
 import time
 from pathlib import Path
 
-from tofcapture.cli.kit import progress
-from tofcapture.command import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome, progress
 from tofcapture.errors import ConfigError
 
 

@@ -11,9 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tofcapture.cli.kit import table
+from tofcapture.cli.kit import Command, Outcome, table
 from tofcapture.cli.setup import bundled_path
-from tofcapture.command import Command, Outcome
 from tofcapture.errors import TofError
 
 SCENES = ("random-8", "random-15", "bottle")

@@ -24,9 +24,9 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 from tofcapture import __version__
+from tofcapture.cli.kit import Command, Outcome
 from tofcapture.cli.probe import Finding, attempt, probe
 from tofcapture.cli.setup import bundled_path, describe_weights, station_path
-from tofcapture.command import Command, Outcome
 from tofcapture.errors import ConfigError, TofError
 
 Examination = Callable[[], Iterator[Finding]]

@@ -1,16 +1,41 @@
-"""What every command shares: progress with the time left, tables of a fixed form, and results as JSON files."""
+"""What every command shares: what a command is, progress with the time left, tables of a fixed form, results as JSON files.
+
+Every package adds its commands through the entry-point group ``tofcapture.commands``. Each entry point names one :class:`Command`.
+Its module is light to import: heavy libraries are imported inside ``run``.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from tofcapture.command import Outcome
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command hands back."""
+
+    #: JSON-serialisable result, printed as one object on stdout under ``--json``.
+    data: dict[str, Any] = field(default_factory=dict)
+    text: str = ""  #: What a person reads on stdout without ``--json``.
+    exit_code: int = 0  #: 0 unless the command succeeded in finding something wrong (``check``).
+
+
+@dataclass(frozen=True)
+class Command:
+    """One sub-command: a line of help, a runnable example, its arguments and its function."""
+
+    help: str
+    example: str
+    configure: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], Outcome]
+
 
 PLAIN_EVERY = 10.0  # s between lines where there is no terminal
 

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tofcapture.command import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome
 from tofcapture.errors import UsageError
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
 from typing import Any
 
-from tofcapture.command import Command
+from tofcapture.cli.kit import Command
 from tofcapture.errors import TofError
 
 
@@ -103,7 +103,7 @@ def _import(name: str, modules: tuple[str, ...], advice: str) -> Finding:
 
 def probe_open3d() -> Iterator[Finding]:
     """Load open3d; a missing libusb is its usual trouble."""
-    from tofcapture.o3d import load_open3d
+    from tofcapture.libraries import load_open3d
 
     verdict = "FAIL" if _version("open3d", "open3d-cpu") else "WARN"
     yield attempt("open3d", lambda: f"{load_open3d().__version__}, loads", verdict)

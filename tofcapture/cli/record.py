@@ -11,9 +11,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tofcapture.cli.kit import progress, table
+from tofcapture.cli.kit import Command, Outcome, progress, table
 from tofcapture.cli.setup import station_path
-from tofcapture.command import Command, Outcome
 from tofcapture.record.observer import Observer
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from tofcapture.command import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome
 from tofcapture.errors import FormatError
 
 VARIABLES = ("TOFCAPTURE_STATION", "TOFCAPTURE_STATE", "TOFCAPTURE_TRACEBACK", "NO_COLOR", "OMP_NUM_THREADS")

@@ -6,8 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tofcapture.cli.kit import progress
-from tofcapture.command import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome, progress
 
 if TYPE_CHECKING:
     from tofcapture.suites.run import Simulated

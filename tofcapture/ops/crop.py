@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.compiled import compiled
+from tofcapture.libraries import compiled
 from tofcapture.poses import Float64
 
 TRIALS = 1000  # finds a plane of a fifth of the points but for 3 in 10 000

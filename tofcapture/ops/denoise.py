@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.compiled import compiled
 from tofcapture.errors import DataError
+from tofcapture.libraries import compiled
 
 Bool = NDArray[np.bool_]
 Float32 = NDArray[np.float32]

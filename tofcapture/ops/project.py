@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.compiled import compiled
 from tofcapture.errors import DataError
+from tofcapture.libraries import compiled
 from tofcapture.poses import invert
 
 Float64 = NDArray[np.float64]

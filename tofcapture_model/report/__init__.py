@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tofcapture.command import Outcome
+from tofcapture.cli.kit import Outcome
 
 VIEWS = 3  # example views: what fits into a few megabytes
 

@@ -17,9 +17,9 @@ from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import Manifest
 from tofcapture.files.shard import GroundTruth, ShardReader
 from tofcapture.poses import Float64
-from tofcapture.viz.clouds import eye_for, splat
 from tofcapture.viz.figures.scenes import Maps, Row
 from tofcapture.viz.page import Picture, map_picture, mask_legend, mask_picture, normal_picture, picture
+from tofcapture.viz.shots import eye_for, splat
 from tofcapture_model.data import batched, make_frame
 from tofcapture_model.networks import Model
 from tofcapture_model.networks.baselines import sensor_estimate

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError
-from tofcapture.o3d import load_open3d
+from tofcapture.libraries import load_open3d
 from tofcapture.poses import Float64, check_transform, transform_points
 
 Float32 = NDArray[np.float32]

@@ -22,7 +22,7 @@ from tofcapture.devices.cameras import (
 from tofcapture.devices.registry import check_keys
 from tofcapture.devices.tof_serial.clock import Anchor, burst_times
 from tofcapture.devices.tof_serial.messages import Info
-from tofcapture.devices.tof_serial.pixels import values
+from tofcapture.devices.tof_serial.packet import values
 from tofcapture.devices.tof_serial.port import Port
 from tofcapture.devices.tof_serial.session import FirmwareError, LinkLostError, Session
 from tofcapture.errors import ConfigError, DeviceError

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, ClassVar, Self
 
-from tofcapture.devices.tof_serial.pixels import packed_size
+from tofcapture.devices.tof_serial.packet import packed_size
 
 CELSIUS_UNKNOWN = -0x8000
 DATA = struct.Struct("<IHI")  # burst, frame, offset; then the whitened bytes

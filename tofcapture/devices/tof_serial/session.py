@@ -30,8 +30,7 @@ from tofcapture.devices.tof_serial.messages import (
     Refused,
     Time,
 )
-from tofcapture.devices.tof_serial.packet import PROTOCOL, Kind, Packet, encode
-from tofcapture.devices.tof_serial.pixels import Assembly
+from tofcapture.devices.tof_serial.packet import PROTOCOL, Assembly, Kind, Packet, encode
 from tofcapture.errors import DeviceError
 
 MS = 1_000_000  # ns

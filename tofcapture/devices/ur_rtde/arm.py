@@ -14,9 +14,16 @@ from tofcapture.devices import Arm
 from tofcapture.devices.clearance import stage_of
 from tofcapture.devices.faults import ArmFault, NotReady
 from tofcapture.devices.kinematics import forward
-from tofcapture.devices.ur_rtde.limits import check_goal, check_way, read_settings
+from tofcapture.devices.ur_rtde.limits import (
+    ARRIVED,
+    check_goal,
+    check_way,
+    duration,
+    follow,
+    read_settings,
+    settle,
+)
 from tofcapture.devices.ur_rtde.link import Link, Sample
-from tofcapture.devices.ur_rtde.motion import ARRIVED, duration, follow, settle
 from tofcapture.devices.ur_rtde.probe import Controller, probe
 from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.frames import ArmInfo, ArmState

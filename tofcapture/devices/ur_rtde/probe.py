@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Self, TextIO
 
 from tofcapture.devices.faults import ControllerSilent, NotReady, StaleData
-from tofcapture.devices.ur_rtde import wire
+from tofcapture.devices.ur_rtde import link as wire
 from tofcapture.devices.ur_rtde.limits import Settings
 
 DASHBOARD = 29999

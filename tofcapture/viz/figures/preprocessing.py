@@ -18,8 +18,8 @@ from tofcapture.ops.crop import crop_depth
 from tofcapture.ops.denoise import denoise
 from tofcapture.poses import Float64, transform_points
 from tofcapture.rig import Rig, load_rig
-from tofcapture.viz.clouds import Eye, eye_for, splat
 from tofcapture.viz.sheet import Cell, Column, draw_table
+from tofcapture.viz.shots import Eye, eye_for, splat
 from tofcapture.viz.sources import pick_view
 
 _CONFIG = SampleConfig()

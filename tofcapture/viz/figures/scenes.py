@@ -16,8 +16,8 @@ from tofcapture.errors import DataError, UsageError
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.shard import GroundTruth, ShardReader
 from tofcapture.poses import Float64
-from tofcapture.viz.clouds import eye_for, splat
 from tofcapture.viz.sheet import DEPTH_KEY, NORMAL_KEY, Cell, Column, draw_table
+from tofcapture.viz.shots import eye_for, splat
 from tofcapture.viz.sources import read_maps
 
 Float32 = NDArray[np.float32]

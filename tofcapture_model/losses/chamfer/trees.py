@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tofcapture.compiled import compiled
+from tofcapture.libraries import compiled
 from tofcapture_model.losses.chamfer.neighbours import image_of, pixels_of, tiles_of
 
 Float32 = NDArray[np.float32]
