@@ -71,9 +71,9 @@ def triangulate(depth: NDArray[np.floating], camera: Camera) -> Sheet:
 
 
 def _dilate(mask: Bool, radius: int) -> Bool:
-    from scipy.ndimage import binary_dilation
+    from scipy.ndimage import maximum_filter
 
-    out: Bool = binary_dilation(mask, np.ones((2 * radius + 1, 2 * radius + 1), dtype=bool))
+    out: Bool = maximum_filter(mask.view(np.uint8), 2 * radius + 1, mode="constant").view(bool)
     return out
 
 
@@ -148,7 +148,7 @@ def project(
     border = _borders(sheet, x, y, T_tof_stereo, far, camera, depth)
     edge = _dilate(np.isnan(depth) | border | _jumps(depth, camera), edge_pixels)
     # Those beside it hit measured surface: marking them too would cost small far objects half of their pixels.
-    edge |= _interpolated(sheet.doubtful, image[..., 1:3])
+    _interpolated(sheet.doubtful, image[..., 1:3], edge)
     aside = np.zeros(camera.shape, dtype=bool)
     if np.isfinite(depth).any():
         near = NEARER * float(np.nanmin(depth))
@@ -162,16 +162,13 @@ def project(
     )
 
 
-def _all_corners(of: Bool) -> tuple[Bool, Bool, Bool, Bool]:
-    return of[:-1, :-1], of[:-1, 1:], of[1:, :-1], of[1:, 1:]
-
-
 def _borders(
     sheet: Sheet, x: Float64, y: Float64, T: Float64, far: float, camera: Camera, depth: Float64
 ) -> Bool:
     """Mark the pixels where the sheet visibly ends or is cut: a vertex there has a quad about it that is no surface."""
     inner = np.zeros_like(sheet.vertex)
-    inner[1:-1, 1:-1] = np.logical_and.reduce(_all_corners(sheet.surface))
+    s = sheet.surface
+    inner[1:-1, 1:-1] = s[:-1, :-1] & s[:-1, 1:] & s[1:, :-1] & s[1:, 1:]
     v, u = np.nonzero(sheet.vertex & ~inner)
     p, q, r = (sheet.depth[v, u] * (T[k, 0] * x[u] + T[k, 1] * y[v] + T[k, 2]) + T[k, 3] for k in range(3))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -185,14 +182,15 @@ def _borders(
     return mark
 
 
-def _interpolated(doubtful: Bool, pixels: Float64) -> Bool:
-    """Mark the pixels whose hit ``pixels`` (H, W, 2) lies on a quad with a doubtful corner."""
-    quads = np.logical_or.reduce(_all_corners(doubtful))
-    hit = np.isfinite(pixels[..., 0])
-    at = np.where(hit[..., None], pixels, 0).astype(np.intp)
-    column, row = (np.minimum(at[..., k], quads.shape[1 - k] - 1) for k in (0, 1))
-    out: Bool = hit & quads[row, column]
-    return out
+@compiled
+def _interpolated(doubtful: Bool, pixels: Float64, mark: Bool) -> None:
+    """Mark the pixels (H, W) whose hit ``pixels`` (H, W, 2) lies on a quad with a doubtful corner."""
+    rows, columns = doubtful.shape
+    for pv in range(mark.shape[0]):
+        for pu in range(mark.shape[1]):
+            if np.isfinite(pixels[pv, pu, 0]):
+                u, v = min(int(pixels[pv, pu, 0]), columns - 2), min(int(pixels[pv, pu, 1]), rows - 2)
+                mark[pv, pu] |= doubtful[v : v + 2, u : u + 2].any()
 
 
 @compiled
