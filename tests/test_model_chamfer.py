@@ -65,7 +65,7 @@ def brute(p, q, p_mask, q_mask, shift):
 
 
 def check(engine, clouds, device="cpu"):
-    """Whose every least distance is, and their mean, to 1e-6 of brute force in float64."""
+    """Every least distance and their mean, to 1e-6 of brute force in float64 and to what float32 resolves of a metre."""
     for shift in SHIFTS:
         _, index, score = (
             x.cpu() if isinstance(x, torch.Tensor) else x
@@ -82,7 +82,7 @@ def check(engine, clouds, device="cpu"):
                 truth[np.arange(len(truth)), number] - least <= 1e-6 * least + 2e-7 * np.sqrt(least) + 1e-13
             ).all()
             means += least.mean()
-        assert score.item() == pytest.approx(means, rel=1e-6, abs=1e-12)
+        assert score.item() == pytest.approx(means, rel=1e-6, abs=2e-7 * means**0.5 + 1e-12)
 
 
 @pytest.mark.parametrize("surface", SURFACES)
