@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.cli.sensor import believed_rig, read_views, saved
+from calibration.cli.sensor import add_recording, believed_rig, read_views, saved
 from tofcapture.cli import kit
 from tofcapture.cli.kit import Outcome
 from tofcapture.errors import DataError, QualityError, UsageError
@@ -36,16 +36,11 @@ def configure_hand_eye(parser: argparse.ArgumentParser) -> None:
         help="one file of pairs (JSON, YAML such as MoveIt's, NPZ, 14 columns); two files of poses (CSV, TUM, JSON, NPY) with times "
         "or pose by pose; or a calibration recording",
     )
-    parser.add_argument(
-        "--eye-to-hand",
-        action="store_true",
-        help="the camera stands beside the arm, the target is on the flange",
-    )
-    parser.add_argument(
-        "--inverted-target",
-        action="store_true",
-        help="the target poses are T_target_camera, not T_camera_target",
-    )
+    for flag, words in (
+        ("--eye-to-hand", "the camera stands beside the arm, the target is on the flange"),
+        ("--inverted-target", "the target poses are T_target_camera, not T_camera_target"),
+    ):
+        parser.add_argument(flag, action="store_true", help=words)
     parser.add_argument(
         "--time-offset",
         type=float,
@@ -141,7 +136,7 @@ def _numbers(values: Any, width: int, digits: int) -> str:
 
 def configure_bundle(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    configure_coverage(parser)
+    add_recording(parser, board=True)
     parser.add_argument(
         "--arm-sigma",
         type=float,
@@ -149,7 +144,6 @@ def configure_bundle(parser: argparse.ArgumentParser) -> None:
         metavar=("M", "RAD"),
         help="standard deviation of an arm pose per axis, metres and radians (default 0.0002 0.00017)",
     )
-    parser.add_argument("--dry-run", action="store_true", help="print the result, write nothing")
 
 
 def run_bundle(args: argparse.Namespace) -> Outcome:

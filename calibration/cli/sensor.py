@@ -32,13 +32,7 @@ THROWN_BACK = 0.0015  # m of spread between views from which light from the surr
 
 
 def read_views(recording: Path, what: str) -> Iterator[tuple[Path, View]]:
-    """Read the calibration views of a recording one by one, with progress.
-
-    Raises
-    ------
-    DataError
-        No or unreadable views.
-    """
+    """Read the calibration views of a recording one by one, with progress; :class:`DataError` where there are none."""
     from calibration.registration.pairs import calibration_views
     from tofcapture.files.view import read_view
 
@@ -73,11 +67,17 @@ def saved(args: argparse.Namespace, name: str, data: dict[str, Any], rig: Rig, t
     return Outcome(data=data, text=text)
 
 
+def add_recording(parser: argparse.ArgumentParser, *, board: bool) -> None:
+    """Declare the arguments that commands on a recording share."""
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help="folder with calibration views")
+    if board:
+        parser.add_argument("--board", default="default", help="packaged board or a TOML file")
+    parser.add_argument("--dry-run", action="store_true", help="print the result, write nothing")
+
+
 def configure_lens(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("recording", type=Path, metavar="RECORDING", help="folder with calibration views")
-    parser.add_argument("--board", default="default", help="packaged board or a TOML file")
-    parser.add_argument("--dry-run", action="store_true", help="print the result, write nothing")
+    add_recording(parser, board=True)
 
 
 def run_lens(args: argparse.Namespace) -> Outcome:
@@ -103,13 +103,7 @@ def run_lens(args: argparse.Namespace) -> Outcome:
 
 
 def board_seen(view: View, camera: Camera, board: Board) -> BoardSeen:
-    """Find the board with the believed lens; keep its rims as pixels, which no lens has touched.
-
-    Raises
-    ------
-    QualityError
-        The board is not found.
-    """
+    """Find the board with the believed lens, or say why not; keep its rims as pixels, which no lens has touched."""
     from calibration.board.detector import NEAR_PLANE, detect, tof_sight
     from calibration.lens.fit import BoardSeen
 
@@ -172,12 +166,11 @@ def lens_table(data: dict[str, Any]) -> str:
 
 def configure_range(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("recording", type=Path, metavar="RECORDING", help="folder with calibration views")
+    add_recording(parser, board=False)
     parser.add_argument(
         "--rig", type=Path, metavar="RIG.toml", help="rig transform to start from (default: the recording's)"
     )
     parser.add_argument("--orders", default="1,2,4", help="of the harmonics (default 1,2,4)")
-    parser.add_argument("--dry-run", action="store_true", help="print the result, write nothing")
 
 
 def run_range(args: argparse.Namespace) -> Outcome:
@@ -228,15 +221,7 @@ def _vouched(recording: Path, rig: Rig) -> tuple[Float64, Float64 | None, str]:
 
 
 def range_report(fit: RangeFit, transform_known: str) -> dict[str, Any]:
-    """Lay a fit out as JSON types.
-
-    Parameters
-    ----------
-    fit
-        The fit.
-    transform_known
-        What vouches for the rig transform: ``aligned``, ``averaged`` or ``nothing``.
-    """
+    """Lay a fit out as JSON types; ``aligned``, ``averaged`` or ``nothing`` vouches for the rig transform."""
     from calibration.limits import worst
 
     rows = [_frequency(fit, i) for i in range(len(fit.terms))]

@@ -92,15 +92,7 @@ def clean(T: ArrayLike, name: str) -> Float64:
 
 
 def check_numbers(A: Float64, B: Float64) -> None:
-    """Refuse unequal or too few pairs and lengths that cannot be metres.
-
-    Raises
-    ------
-    DataError
-        Unequal numbers of poses.
-    HandEyeRefused
-        Too few pairs; wrong units.
-    """
+    """Refuse unequal numbers of poses (:class:`DataError`), too few of them and lengths that cannot be metres (by name)."""
     if len(A) != len(B):
         raise DataError(
             f"hand-eye: expected as many target poses as hand poses, got {len(B)} and {len(A)}",
@@ -120,16 +112,9 @@ def check_numbers(A: Float64, B: Float64) -> None:
 
 
 def check_motion(A: Float64, B: Float64) -> tuple[float, float, float]:
-    """Refuse motion that does not determine the answer.
+    """Refuse motion of hand and target poses (N, 4, 4) that does not determine the answer.
 
-    Parameters
-    ----------
-    A, B
-        (N, 4, 4) hand and target poses.
-
-    Returns
-    -------
-    RMS rotation of the relative motions of the hand about their three principal axes, radians, descending.
+    Returns the RMS rotation of the relative motions of the hand about their three principal axes, radians, descending.
 
     Raises
     ------
@@ -167,13 +152,7 @@ def check_motion(A: Float64, B: Float64) -> tuple[float, float, float]:
 
 
 def check_pairing(A: Float64, B: Float64) -> None:
-    """Refuse pairs whose screws are not congruent in angle.
-
-    Raises
-    ------
-    HandEyeRefused
-        Pairs shifted against each other, or shuffled.
-    """
+    """Refuse pairs whose screws are not congruent in angle: shifted against each other, or shuffled."""
     mismatch = _angle_mismatch(A, B)
     if mismatch <= MISMATCH:
         return

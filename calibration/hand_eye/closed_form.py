@@ -60,17 +60,7 @@ def nearest_rotation(M: Float64) -> Float64:
 
 
 def park_martin(P: Float64, B: Float64) -> Float64:
-    """Solve AX = XB after Park and Martin (IEEE T-RA 10(5), 1994) over all couples of pairs.
-
-    Parameters
-    ----------
-    P, B
-        (N, 4, 4), N >= 3.
-
-    Returns
-    -------
-    X, (4, 4) float64
-    """
+    """Solve AX = XB after Park and Martin (IEEE T-RA 10(5), 1994) over all couples of pairs (N, 4, 4); returns X (4, 4)."""
     A_ij, B_ij = relative_motions(P, B)
     alpha, beta = rotation_vectors(A_ij[:, :3, :3]), rotation_vectors(B_ij[:, :3, :3])
     safe = np.linalg.norm(alpha, axis=1) < NEAR_PI
@@ -85,19 +75,10 @@ def _translation(A: Float64, B: Float64, rotation: Float64) -> Float64:
 
 
 def shah(P: Float64, B: Float64) -> tuple[Float64, Float64]:
-    """Solve AX = ZB with the Kronecker product (Shah, J. Mechanisms Robotics 5(3), 2013).
+    """Solve AX = ZB with the Kronecker product (Shah, J. Mechanisms Robotics 5(3), 2013): X and Z (..., 4, 4).
 
-    The rotations are the dominant singular pair of ``sum_i R_P (x) R_B``, the translations linear least squares.
-
-    Parameters
-    ----------
-    P, B
-        (..., N, 4, 4), N >= 3; leading axes are separate problems.
-
-    Returns
-    -------
-    X, Z
-        (..., 4, 4) float64.
+    The rotations are the dominant singular pair of ``sum_i R_P (x) R_B``, the translations linear least squares. Pairs are
+    (..., N, 4, 4), N >= 3; leading axes are separate problems.
     """
     R_P, R_B = P[..., :3, :3], B[..., :3, :3]
     K = np.einsum("...nac,...ndb->...abcd", R_P, R_B).reshape(*P.shape[:-3], 9, 9)
@@ -123,18 +104,10 @@ def _two_translations(P: Float64, B: Float64, R_X: Float64) -> tuple[Float64, Fl
 
 
 def residuals(P: Float64, B: Float64, X: Float64, Z: Float64) -> Float64:
-    """What the camera should have seen minus what it saw, in the camera frame.
+    """Return what the camera should have seen minus what it saw, in the camera frame.
 
-    Parameters
-    ----------
-    P, B
-        (..., N, 4, 4).
-    X, Z
-        (..., 4, 4).
-
-    Returns
-    -------
-    (..., N, 6) float64: displacement of the board's origin in metres, then rotation vector in radians.
+    Pairs (..., N, 4, 4), X and Z (..., 4, 4) give (..., N, 6) float64: displacement of the board's origin in metres, then rotation
+    vector in radians.
     """
     seen = invert_all(P @ X[..., None, :, :]) @ Z[..., None, :, :]
     turned = rotation_vectors(seen[..., :3, :3] @ np.swapaxes(B[..., :3, :3], -1, -2))
@@ -168,12 +141,9 @@ class Consensus:
 
 
 def consensus(P: Float64, B: Float64) -> Consensus:
-    """Find the largest agreement among pairs by samples of four, then solve with everyone who agrees.
+    """Find the largest agreement among pairs (N, 4, 4) by samples of four, then solve with everyone who agrees.
 
-    Parameters
-    ----------
-    P, B
-        (N, 4, 4), N >= 3; all pairs are solved at once when N is below 8, where sampling has nothing to choose from.
+    All pairs are solved at once when N is below 8, where sampling has nothing to choose from.
     """
     best = _agreement(P, B, *shah(P, B))
     if len(P) < 2 * SAMPLE:

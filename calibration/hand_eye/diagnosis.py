@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,7 @@ SECOND = 0.6  # share of the remainder that must agree on a second board
 SHOWN = 120  # pairs that a diagnosis looks at
 
 
-@dataclass(frozen=True)
-class Mistake:
+class Mistake(NamedTuple):
     """One reading of the pairs that would be right if a certain mistake had been made."""
 
     cause: Cause
@@ -38,7 +37,7 @@ def oriented(A: Float64, *, eye_to_hand: bool) -> Float64:
 
 
 def check_agreement(A: Float64, B: Float64, found: Consensus, *, eye_to_hand: bool) -> None:
-    """Refuse pairs that fit badly, or that fit much better once a mistake is undone.
+    """Refuse pairs that fit badly, or that fit much better once a mistake is undone, by the cause that explains them best.
 
     Parameters
     ----------
@@ -48,11 +47,6 @@ def check_agreement(A: Float64, B: Float64, found: Consensus, *, eye_to_hand: bo
         Their consensus.
     eye_to_hand
         How they are read.
-
-    Raises
-    ------
-    HandEyeRefused
-        With the cause that explains the pairs best.
     """
     P = oriented(A, eye_to_hand=eye_to_hand)
     few = thinned(len(A), SHOWN)

@@ -226,7 +226,7 @@ def _two_of_table(path: Path, text: str) -> tuple[Readings, Readings]:
 def _flat(value: Any, where: str) -> tuple[str, list[float]]:
     """Row of numbers of one pose, and its quaternion's order where a dictionary told it."""
     if not isinstance(value, Mapping):
-        return "", _numbers_in(value, "a pose in numbers", where).ravel().tolist()
+        return "", _array(value, "a pose in numbers", where).ravel().tolist()
     known = _lower(value)
     if (inner := _first(known, WRAPPED)) is not None:
         return _flat(inner, where)
@@ -234,28 +234,18 @@ def _flat(value: Any, where: str) -> tuple[str, list[float]]:
     if move is None or turn is None:
         got = ", ".join(known) or "nothing"
         raise FormatError(f"{where}: expected a translation and a rotation, got {got}")
-    xyz = _components(move, "xyz", where)
-    if isinstance(turn, Mapping):
-        return USUAL, [*xyz, *_components(turn, USUAL, where)]
-    rest = _numbers_in(turn, "a rotation in numbers", where)
-    if rest.shape == (3, 3):
-        return "", np.c_[rest, xyz].ravel().tolist()
-    return "", [*xyz, *rest.ravel().tolist()]
+    xyz, rest = _array(move, "x, y, z", where), _array(turn, "a rotation: x, y, z, w", where)
+    order = USUAL if isinstance(turn, Mapping) else ""
+    return order, (np.c_[rest, xyz] if rest.shape == (3, 3) else np.r_[xyz, rest]).ravel().tolist()
 
 
-def _numbers_in(value: Any, what: str, where: str) -> Float64:
+def _array(value: Any, what: str, where: str) -> Float64:
+    """Numbers, or those of a dictionary of x, y, z and maybe w."""
     try:
-        return np.asarray(value, dtype=np.float64)
-    except (ValueError, TypeError) as err:
+        row = [value[n] for n in ("xyzw" if "w" in value else "xyz")] if isinstance(value, Mapping) else value
+        return np.asarray(row, dtype=np.float64)
+    except (KeyError, ValueError, TypeError) as err:
         raise FormatError(f"{where}: expected {what}, got {str(value)[:60]!r}") from err
-
-
-def _components(value: Any, names: str, where: str) -> list[float]:
-    try:
-        row = [value[n] for n in names] if isinstance(value, Mapping) else list(value)
-        return [float(x) for x in row]
-    except (KeyError, TypeError, ValueError) as err:
-        raise FormatError(f"{where}: expected {', '.join(names)}, got {str(value)[:60]!r}") from err
 
 
 def _of_rows(rows: Float64, where: str, order: str = "") -> Readings:

@@ -51,13 +51,7 @@ class Stream:
 
 
 def make_stream(seconds: ArrayLike, poses: ArrayLike, name: str) -> Stream:
-    """Check and sort a stream.
-
-    Raises
-    ------
-    DataError
-        Times that are not finite or not distinct, poses that are not rigid, fewer than ten.
-    """
+    """Check and sort a stream; :class:`DataError` for bad times, poses that are not rigid, fewer than ten poses."""
     t, T = np.asarray(seconds, dtype=np.float64), clean(poses, name)
     if t.shape != (len(T),) or not np.isfinite(t).all():
         raise DataError(f"{name}: expected one finite time per pose, got {t.shape} for {len(T)} poses")
@@ -223,7 +217,7 @@ class _Seen:
 def recording_pairs(
     recording: Path, progress: Callable[[str, int, int], None] = lambda _stage, _done, _total: None
 ) -> tuple[Float64, Float64]:
-    """Take hand poses, and the pose of the first view's stereo frame in every view's stereo camera.
+    """Take T_base_flange and T_stereo_target (N, 4, 4) from the views that register; the target is the first view's stereo frame.
 
     Parameters
     ----------
@@ -231,13 +225,6 @@ def recording_pairs(
         Folder with ``views/calibration/view-*.h5``.
     progress
         Called with a stage, steps done and steps in all.
-
-    Returns
-    -------
-    hand
-        (N, 4, 4) T_base_flange of the views that registered.
-    target
-        (N, 4, 4) T_stereo_target.
 
     Raises
     ------

@@ -68,15 +68,13 @@ def refine(
     Parameters
     ----------
     P, B
-        (N, 4, 4) pairs, N >= 3.
+        (N, 4, 4) pairs, N >= 3; P is T_flange_base, not T_base_flange, where ``eye_to_hand``.
     X, Z
         Start, (4, 4).
     noise
         First guess of the noise per axis: metres, radians.
     blocks
         Stretches of consecutive pairs that share their errors (streams); each pair is its own when None.
-    eye_to_hand
-        Where the flange is: P is T_flange_base, not T_base_flange.
     """
     whole = np.repeat(np.square(np.maximum(noise, FLOOR)), 3)
     camera, arm = np.diag(whole / 2), whole / 2

@@ -114,7 +114,7 @@ def _warnings(
     B: Float64, outliers: NDArray[np.bool_], variances: Float64, scale: tuple[float, float]
 ) -> tuple[str, ...]:
     moved, turned = np.sqrt(variances[:3].sum()), np.sqrt(variances[3:].sum())
-    bad, factor, off = np.flatnonzero(outliers).tolist(), *scale
+    bad, (factor, off) = np.flatnonzero(outliers).tolist(), scale
     behind = int((B[:, 2, 3] <= 0).sum())
     said = (
         (len(B) < FEW, f"only {len(B)} pairs: the error bars are themselves uncertain"),

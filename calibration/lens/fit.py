@@ -41,18 +41,10 @@ class LensRefused(QualityError):  # noqa: N818  a gate's answer is a refusal, no
 
 @dataclass(frozen=True)
 class BoardSeen:
-    """Rims of one view.
+    """Rims of one view."""
 
-    Attributes
-    ----------
-    pixels
-        (N, 2) rims of the board, image as it was taken.
-    T_camera_board
-        (4, 4) first guess.
-    """
-
-    pixels: Float64
-    T_camera_board: Float64
+    pixels: Float64  #: (N, 2) rims of the board, image as it was taken
+    T_camera_board: Float64  #: (4, 4) first guess
 
 
 Look = Callable[
@@ -62,35 +54,16 @@ Look = Callable[
 
 @dataclass(frozen=True)
 class BoardLens:
-    """A lens fitted to board views.
+    """A lens fitted to V board views."""
 
-    Attributes
-    ----------
-    camera
-        The answer.
-    model
-        Which of ``MODELS`` the views ask for.
-    sigma
-        (9,) one sigma of ``NAMES`` from leaving views out; 0 for what was held.
-    rms
-        Root mean square distance of rims to edges, pixels.
-    left_out
-        (V,) the same at each view with the lens of the others.
-    growth
-        How far rims lie off the material, pixels.
-    coverage
-        (2,) share of the image's width and height that rims span.
-    pixel_sigma
-        Largest one sigma over the image's corners of where a ray is seen, pixels, a common shift of pose taken off.
-    """
-
-    camera: Camera
-    model: str
-    sigma: Float64
-    rms: float
-    left_out: Float64
-    growth: float
-    coverage: Float64
+    camera: Camera  #: The answer
+    model: str  #: Which of ``MODELS`` the views ask for
+    sigma: Float64  #: (9,) one sigma of ``NAMES`` from leaving views out; 0 for what was held
+    rms: float  #: Root mean square distance of rims to edges, pixels
+    left_out: Float64  #: (V,) the same at each view with the lens of the others
+    growth: float  #: How far rims lie off the material, pixels
+    coverage: Float64  #: (2,) share of the image's width and height that rims span
+    #: Largest one sigma over the image's corners of where a ray is seen, pixels, a common shift of pose taken off
     pixel_sigma: float
 
 
@@ -125,17 +98,8 @@ def fit_lens(model: Model, look: Look, camera: Camera) -> tuple[BoardLens, list[
     camera
         To start from, good to some per cent.
 
-    Returns
-    -------
-    fit
-        The lens of the second look, unless the boards found in addition do not fit it.
-    refused
-        Why views were not used.
-
-    Raises
-    ------
-    DataError, LensRefused
-        As :func:`fit_lens_to_board`.
+    Returns the lens of the second look, unless the boards found in addition do not fit it, and why views were not used.
+    Raises as :func:`fit_lens_to_board`.
     """
     views, refused = look(camera)
     fit = fit_lens_to_board(model, views, camera)
@@ -204,14 +168,18 @@ def _camera(values: Float64, like: Camera) -> Camera:
 def _fit(model: Model, views: Sequence[BoardSeen], start: Camera, name: str, free: int) -> BoardLens:
     guess = _Guess(start, 0.0, tuple(v.T_camera_board for v in views))
     begin = lens_values(start)
+
+    def linearised(scale: float) -> list[_Equations]:
+        return [_equations(model, v, T, guess, scale) for v, T in zip(views, guess.poses, strict=True)]
+
     for step in range(len(SCALES) + MORE_STEPS):
-        equations = _all_equations(model, views, guess, SCALES[min(step, len(SCALES) - 1)])
+        equations = linearised(SCALES[min(step, len(SCALES) - 1)])
         delta = _without_fold(guess.camera, _solve(equations, lens_values(guess.camera) - begin, free))
         guess = _moved(guess, delta, equations, free)
         moves = [np.mean((e.shared @ delta) ** 2) for e in equations]
         if step >= len(SCALES) and np.sqrt(np.mean(moves)) < SETTLED:
             break
-    equations = _all_equations(model, views, guess, SCALES[-1])
+    equations = linearised(SCALES[-1])
     away = lens_values(guess.camera) - begin
     without = np.stack([_solve([e for e in equations if e is not own], away, free) for own in equations])
     n = len(equations)
@@ -227,10 +195,6 @@ def _fit(model: Model, views: Sequence[BoardSeen], start: Camera, name: str, fre
         coverage=np.ptp(pixels, axis=0) / [start.width, start.height],
         pixel_sigma=_pixel_sigma(guess.camera, spread[:9, :9]),
     )
-
-
-def _all_equations(model: Model, views: Sequence[BoardSeen], guess: _Guess, scale: float) -> list[_Equations]:
-    return [_equations(model, v, T, guess, scale) for v, T in zip(views, guess.poses, strict=True)]
 
 
 def _equations(model: Model, view: BoardSeen, T: Float64, guess: _Guess, scale: float) -> _Equations:

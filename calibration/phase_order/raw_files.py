@@ -1,4 +1,4 @@
-"""Raw frames of any make: arrays in NPY, NPZ and HDF5, and folders of images, brought into (frames, K, H, W)."""
+"""Raw frames of any make: arrays in NPY, NPZ and HDF5, binary words, and folders of images, brought into (frames, K, H, W)."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from tofcapture.errors import ConfigError, DataError, FormatError
 
 IMAGES = (".png", ".tif", ".tiff", ".pgm", ".bmp")
 BINARY = (".raw", ".bin")
+NAMES = ("raw", "frames", "taps", "data")  # of the array that is meant where a file holds several
 HEADER_ROWS = 4  # at most so many rows of an image are metadata
 
 
@@ -37,21 +38,22 @@ def read_raw(path: Path, channels: int, shape: tuple[int, int] | None = None) ->
     DataError, FormatError
         No such file, nothing in it, sizes that do not fit.
     """
+    suffix = path.suffix.lower()
     if not path.exists():
         raise DataError(f"{path}: no such file")
     if path.is_dir():
         found = _folder(path, shape)
-    elif path.suffix.lower() in {".npy", ".npz"}:
+    elif suffix in {".npy", ".npz"}:
         found = _numpy(path)
-    elif path.suffix.lower() in {".h5", ".hdf5", ".hdf"}:
+    elif suffix in {".h5", ".hdf5", ".hdf"}:
         found = _hdf5(path)
-    elif path.suffix.lower() in BINARY:
+    elif suffix in BINARY:
         found = _binary(path, shape)
     else:
         raise FormatError(
-            f"{path}: expected .npy, .npz, .h5, .raw, .bin or a folder of images, got {path.suffix!r}"
+            f"{path}: expected .npy, .npz, .h5, .raw, .bin or a folder of images, got {suffix!r}"
         )
-    return signed(without_metadata(_framed(found, channels, str(path))))
+    return without_metadata(_framed(found, channels, str(path)))
 
 
 def _numpy(path: Path) -> NDArray[Any]:
@@ -59,7 +61,7 @@ def _numpy(path: Path) -> NDArray[Any]:
         held = np.load(path, allow_pickle=False)
     except (ValueError, EOFError, OSError) as err:
         raise FormatError(f"{path}: expected an array in .npy or .npz format, got {err}") from err
-    return held if isinstance(held, np.ndarray) else np.asarray(_only({k: held[k] for k in held.files}, path))
+    return held if isinstance(held, np.ndarray) else np.asarray(_only(dict(held), path))
 
 
 def _hdf5(path: Path) -> NDArray[Any]:
@@ -68,7 +70,7 @@ def _hdf5(path: Path) -> NDArray[Any]:
     held: dict[str, Any] = {}
 
     def keep(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and item.ndim >= 3:
+        if isinstance(item, h5py.Dataset):
             held[name] = item
 
     try:
@@ -82,10 +84,7 @@ def _hdf5(path: Path) -> NDArray[Any]:
 def _only(arrays: dict[str, Any], path: Path) -> Any:
     """The array called raw, or the only one with images in it."""
     images = {k: v for k, v in arrays.items() if v.ndim >= 3}
-    raw = {
-        k: v for k, v in images.items() if k.rsplit("/", 1)[-1].lower() in {"raw", "frames", "taps", "data"}
-    }
-    chosen = raw or images
+    chosen = {k: v for k, v in images.items() if k.rsplit("/", 1)[-1].lower() in NAMES} or images
     if len(chosen) != 1:
         raise FormatError(
             f"{path}: expected one array of images, got {', '.join(f'{k} {v.shape}' for k, v in chosen.items()) or 'none'}",
@@ -120,11 +119,9 @@ def _image(path: Path) -> NDArray[Any]:
     found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if found is None:
         raise FormatError(f"{path}: expected an image")
-    if found.ndim == 3:
-        if (found[..., :1] != found[..., :3]).any():
-            raise FormatError(f"{path}: expected one channel of grey, got colours")
-        found = found[..., 0]
-    return np.asarray(found)
+    if found.ndim == 3 and (found[..., :1] != found[..., :3]).any():
+        raise FormatError(f"{path}: expected one channel of grey, got colours")
+    return np.asarray(found[..., 0] if found.ndim == 3 else found)
 
 
 def _binary(path: Path, shape: tuple[int, int] | None) -> NDArray[Any]:
@@ -132,8 +129,7 @@ def _binary(path: Path, shape: tuple[int, int] | None) -> NDArray[Any]:
     if shape is None:
         raise FormatError(f"{path}: a binary file does not say its size", hint="--shape H,W")
     words = np.frombuffer(path.read_bytes(), dtype="<u2")
-    size = shape[0] * shape[1]
-    if not len(words) or len(words) % size:
+    if not len(words) or len(words) % (shape[0] * shape[1]):
         raise FormatError(
             f"{path}: expected a multiple of {shape[0]} x {shape[1]} 16-bit words, got {len(words)}",
             hint=f"rows of metadata count: {len(words) / shape[1]:g} rows of {shape[1]} in all",
@@ -148,7 +144,7 @@ def _roughness(images: NDArray[Any]) -> float:
 
 
 def _framed(raw: NDArray[Any], channels: int, where: str) -> NDArray[Any]:
-    """Bring (N, H, W), (K, H, W), (N, K, H, W) and channels-last arrays into (frames, K, H, W)."""
+    """Bring (N, H, W), (K, H, W), (N, K, H, W) and channels-last arrays into signed (frames, K, H, W)."""
     if raw.dtype.kind not in "iuf":
         raise FormatError(f"{where}: expected numbers, got {raw.dtype}")
     raw = raw.astype(raw.dtype.newbyteorder("="), copy=False)
@@ -167,7 +163,7 @@ def _framed(raw: NDArray[Any], channels: int, where: str) -> NDArray[Any]:
             f"{where}: expected (frames, {channels}, H, W) or a multiple of {channels} images, got shape {raw.shape}",
             hint="--mhz says how many frequencies there are: 4 phase images each",
         )
-    return raw
+    return signed(raw)
 
 
 def signed(raw: NDArray[Any]) -> NDArray[Any]:
@@ -196,6 +192,5 @@ def without_metadata(raw: NDArray[Any]) -> NDArray[Any]:
     step = np.median(np.abs(np.diff(mean, axis=0)), axis=1) + 1e-9
     typical = float(np.median(step[HEADER_ROWS:-HEADER_ROWS])) if len(step) > 4 * HEADER_ROWS else np.inf
     odd = step > 5 * typical + 0.02 * float(np.median(np.abs(mean)))
-    first = max((i + 1 for i in range(HEADER_ROWS) if i < len(odd) and odd[i]), default=0)
-    last = max((i + 1 for i in range(HEADER_ROWS) if i < len(odd) and odd[-1 - i]), default=0)
+    first, last = (max(np.flatnonzero(side[:HEADER_ROWS]) + 1, default=0) for side in (odd, odd[::-1]))
     return raw[..., first : raw.shape[-2] - last, :]

@@ -47,45 +47,23 @@ PRIOR = {
 
 @dataclass(frozen=True)
 class RangeFit:
-    """Fitted range errors.
+    """Fitted range errors of F frequencies."""
 
-    Attributes
-    ----------
-    camera
-        Of the ToF.
-    errors
-        One per frequency, ascending: the maker's and what was found, together.
-    terms
-        Which terms each has.
-    coefficients, sigma
-        Per frequency (T,): found beside the maker's, and one sigma from leaving views out.
-    T_tof_stereo
-        (4, 4), moved within its prior.
-    moved
-        (6,) twist (rho, phi) about the centre by which it moved, metres and radians.
-    spread
-        (F,) one sigma of the views' own offsets, metres.
-    before, after, left_out
-        Per view (F, N): error of the maker's calibration, of the fitted one, and of the one fitted to the other views, metres.
-    views
-        What was compared.
-    refused
-        Why other views were not.
-    """
-
-    camera: Camera
-    errors: tuple[RangeError, ...]
-    terms: tuple[Terms, ...]
+    camera: Camera  #: Of the ToF
+    errors: tuple[RangeError, ...]  #: One per frequency, ascending: the maker's and what was found, together
+    terms: tuple[Terms, ...]  #: Which terms each has
+    #: Per frequency (T,): found beside the maker's, and one sigma from leaving views out
     coefficients: tuple[Float64, ...]
     sigma: tuple[Float64, ...]
-    T_tof_stereo: Float64
-    moved: Float64
-    spread: Float64
+    T_tof_stereo: Float64  #: (4, 4), moved within its prior
+    moved: Float64  #: (6,) twist (rho, phi) about the centre by which it moved, metres and radians
+    spread: Float64  #: (F,) one sigma of the views' own offsets, metres
+    #: Per view (F, N): error of the maker's calibration, of the fitted one, and of the one fitted to the other views, metres
     before: list[Float64]
     after: list[Float64]
     left_out: list[Float64]
-    views: list[RangeView]
-    refused: list[str]
+    views: list[RangeView]  #: What was compared
+    refused: list[str]  #: Why other views were not
 
 
 def fit_ranges(
@@ -316,15 +294,21 @@ def _solve(p: _Problem, rounds: int) -> _Found:
     return _Found(x, left_out, jackknife(left_out)[1] + believed, variances)
 
 
+def _eliminated(
+    p: _Problem, v: int, i: int, robust: Float64, variances: Float64
+) -> tuple[Float64, Float64, Float64, Float64]:
+    """Columns (N, U) of one view and frequency, its weights times them, and of its own errors the weighted columns and covariance."""
+    w = (robust[i] * p.weight[v][i])[:, None]
+    BW = p.own[v] * w
+    return p.shared[v][i], p.shared[v][i] * w, BW, np.linalg.inv(BW.T @ p.own[v] + np.diag(1 / variances[i]))
+
+
 def _reduced(p: _Problem, v: int, robust: Float64, variances: Float64) -> tuple[Float64, Float64]:
     """Equations of the shared unknowns of one view, its own ones eliminated."""
-    U = len(p.prior)
-    H, g = np.zeros((U, U)), np.zeros(U)
-    B = p.own[v]
-    for i, (A, y) in enumerate(zip(p.shared[v], p.y[v], strict=True)):
-        w = robust[i] * p.weight[v][i]
-        AW, BW = A * w[:, None], B * w[:, None]
-        gain = (AW.T @ B) @ np.linalg.inv(BW.T @ B + np.diag(1 / variances[i]))
+    H, g = np.zeros((len(p.prior), len(p.prior))), np.zeros(len(p.prior))
+    for i, y in enumerate(p.y[v]):
+        A, AW, BW, C = _eliminated(p, v, i, robust, variances)
+        gain = (AW.T @ p.own[v]) @ C
         H += AW.T @ A - gain @ (BW.T @ A)
         g += AW.T @ y - gain @ (BW.T @ y)
     return H, g
@@ -333,10 +317,8 @@ def _reduced(p: _Problem, v: int, robust: Float64, variances: Float64) -> tuple[
 def _own(p: _Problem, v: int, robust: Float64, variances: Float64, x: Float64) -> tuple[Float64, Float64]:
     """A view's own errors (F, OWN) and their second moments."""
     out, moments = np.zeros_like(variances), np.zeros_like(variances)
-    B = p.own[v]
-    for i, (A, y) in enumerate(zip(p.shared[v], p.y[v], strict=True)):
-        BW = B * (robust[i] * p.weight[v][i])[:, None]
-        C = np.linalg.inv(BW.T @ B + np.diag(1 / variances[i]))
+    for i, y in enumerate(p.y[v]):
+        A, _, BW, C = _eliminated(p, v, i, robust, variances)
         out[i] = C @ (BW.T @ (y - A @ x))
         moments[i] = np.square(out[i]) + np.diag(C)
     return out, moments

@@ -29,21 +29,11 @@ SIMPLE = ("offset", "radius", *waves(ORDERS))  # what is found together with a r
 
 @dataclass(frozen=True)
 class Terms:
-    """Name the terms of one frequency's range error.
-
-    Attributes
-    ----------
-    modulation_hz
-        The frequency.
-    names
-        T names, in the order of the columns.
-    reference_celsius
-        Where the temperature's term is zero.
-    """
+    """Name the T terms of one frequency's range error."""
 
     modulation_hz: float
-    names: tuple[str, ...] = SIMPLE
-    reference_celsius: float = RangeError.reference_celsius
+    names: tuple[str, ...] = SIMPLE  #: In the order of the columns
+    reference_celsius: float = RangeError.reference_celsius  #: Where the temperature's term is zero
 
     def columns(
         self,

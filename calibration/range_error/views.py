@@ -33,70 +33,31 @@ FEWEST_PIXELS = 150
 
 @dataclass(frozen=True)
 class Seen:
-    """Keep of a view what its ranges are judged by.
+    """A view's part that its ranges are judged by."""
 
-    Attributes
-    ----------
-    name
-        Path of the view.
-    info
-        The ToF camera.
-    phasor
-        (F, H, W) complex128, mean of the burst.
-    saturated
-        (H, W).
-    sigma
-        (H, W) metres, noise of the high frequency's mean range.
-    celsius
-        Mean temperature; NaN when the camera does not say.
-    stereo
-        Intrinsics of the stereo grid.
-    depth
-        (SH, SW) stereo frame, metres; NaN where nothing was measured.
-    """
-
-    name: str
-    info: TofInfo
-    phasor: NDArray[np.complex128]
-    saturated: Mask
-    sigma: Float64
-    celsius: float
-    stereo: Camera
-    depth: NDArray[np.float32]
+    name: str  #: Path of the view
+    info: TofInfo  #: The ToF camera
+    phasor: NDArray[np.complex128]  #: (F, H, W) mean of the burst
+    saturated: Mask  #: (H, W)
+    sigma: Float64  #: (H, W) metres, noise of the high frequency's mean range
+    celsius: float  #: Mean temperature; NaN when the camera does not say
+    stereo: Camera  #: Intrinsics of the stereo grid
+    depth: NDArray[np.float32]  #: (SH, SW) stereo frame, metres; NaN where nothing was measured
 
 
 @dataclass(frozen=True)
 class RangeView:
-    """Hold measured and true ranges of one view's N board pixels.
+    """Measured and true ranges of one view's N board pixels at F frequencies."""
 
-    Attributes
-    ----------
-    name
-        Path of the view.
-    pixels
-        (N,) flat indices.
-    true
-        (N,) metres, half the path lamp - surface - camera, by the stereo camera.
-    lever
-        (N, 6) metres per unit of a twist (rho, phi) about ``centre``, ToF axes, on the left of ``T_tof_stereo``.
-    measured
-        (F, N) metres, wrapped, with all errors.
-    sigma
-        (F, N) metres.
-    amplitude
-        (F, N) raw units.
-    celsius
-        Mean temperature.
-    """
-
-    name: str
-    pixels: NDArray[np.intp]
-    true: Float64
+    name: str  #: Path of the view
+    pixels: NDArray[np.intp]  #: (N,) flat indices
+    true: Float64  #: (N,) metres, half the path lamp - surface - camera, by the stereo camera
+    #: (N, 6) metres per unit of a twist (rho, phi) about ``centre``, ToF axes, on the left of ``T_tof_stereo``
     lever: Float64
-    measured: Float64
-    sigma: Float64
-    amplitude: Float64
-    celsius: float
+    measured: Float64  #: (F, N) metres, wrapped, with all errors
+    sigma: Float64  #: (F, N) metres
+    amplitude: Float64  #: (F, N) raw units
+    celsius: float  #: Mean temperature
 
 
 def seen_of(view: View, name: str) -> Seen:
@@ -118,19 +79,12 @@ def seen_of(view: View, name: str) -> Seen:
 def surface_at_pixels(seen: Seen, T_tof_stereo: Float64) -> tuple[Float64, Mask]:
     """Fit the stereo surface where every ToF pixel's ray meets it, as ground truth does.
 
-    Parameters
-    ----------
-    seen
-        The view.
-    T_tof_stereo
-        (4, 4).
-
     Returns
     -------
     planes
         (H, W, 3) m with ``m . p = 1``, ToF frame, 1 / metres; NaN where there is no surface.
     good
-        (H, W) one smooth surface that both cameras see, not at a grazing angle.
+        (H, W) one smooth surface, not at a grazing angle.
     """
     camera = seen.info.camera
     sheet = triangulate(seen.depth, seen.stereo)
@@ -150,16 +104,7 @@ def surface_at_pixels(seen: Seen, T_tof_stereo: Float64) -> tuple[Float64, Mask]
 
 
 def range_view(seen: Seen, T_tof_stereo: Float64, centre: Float64) -> RangeView:
-    """Compare the ranges of a view's board with the stereo surface.
-
-    Parameters
-    ----------
-    seen
-        The view.
-    T_tof_stereo
-        (4, 4).
-    centre
-        (3,) about which twists turn, ToF frame, metres.
+    """Compare a view's ranges with the stereo surface; twists turn about ``centre`` (3,), ToF frame, metres.
 
     Raises
     ------
@@ -236,11 +181,8 @@ def common_camera(views: Sequence[Seen]) -> TofInfo:
     """Return the camera of all views; :class:`DataError` when they are of different ones."""
     first = views[0].info
     for view in views[1:]:
-        own = view.info
-        if (own.camera, own.modulation_hz, own.range_errors) != (
-            first.camera,
-            first.modulation_hz,
-            first.range_errors,
+        if any(
+            getattr(view.info, k) != getattr(first, k) for k in ("camera", "modulation_hz", "range_errors")
         ):
             raise DataError(
                 f"{view.name}: taken with another ToF camera or calibration than {views[0].name}",
