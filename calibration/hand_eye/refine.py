@@ -29,7 +29,6 @@ class Refined:
     X: Float64  #: (4, 4)
     Z: Float64  #: (4, 4)
     residual: Float64  #: (N, 6) metres and radians, camera frame
-    weight: Float64  #: (N,) in (0, 1.75]; near 0 for outliers
     scatter: Float64  #: (N, 6, 6) covariance of each pair's noise
     #: (12, 12) of (t_X, phi_X, t_Z, phi_Z): metres, radians, rotations in the left tangent space
     covariance: Float64
@@ -91,7 +90,7 @@ def refine(
     r, J = residuals(P, B, X, Z), jacobian(P, X, Z)
     scatter = _total(camera, arm, _lever(P, X, Z, eye_to_hand=eye_to_hand))
     weight = _weights(r, _inverse(scatter))
-    return Refined(X, Z, r, weight, scatter, *_uncertainty(J, r, weight, scatter, blocks))
+    return Refined(X, Z, r, scatter, *_uncertainty(J, r, weight, scatter, blocks))
 
 
 def _lever(P: Float64, X: Float64, Z: Float64, *, eye_to_hand: bool) -> Float64:

@@ -49,7 +49,6 @@ class Seen:
 class RangeView:
     """Measured and true ranges of one view's N board pixels at F frequencies."""
 
-    name: str  #: Path of the view
     pixels: NDArray[np.intp]  #: (N,) flat indices
     true: Float64  #: (N,) metres, half the path lamp - surface - camera, by the stereo camera
     #: (N, 6) metres per unit of a twist (rho, phi) about ``centre``, ToF axes, on the left of ``T_tof_stereo``
@@ -135,7 +134,6 @@ def range_view(seen: Seen, T_tof_stereo: Float64, centre: Float64) -> RangeView:
     flat = seen.phasor.reshape(len(hz), -1)[:, pixels]
     noise = seen.sigma.reshape(-1)[pixels]
     return RangeView(
-        name=seen.name,
         pixels=pixels,
         true=(radial + length) / 2,
         lever=moved * (gain * radial)[:, None],  # n / (n . u) = m r, as m . u r = 1
