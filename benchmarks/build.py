@@ -23,8 +23,7 @@ import numpy as np
 
 from benchmarks import build_peer
 from tofcapture.dataset.build import build_dataset, scene_tasks
-from tofcapture.dataset.sample import SampleConfig, decoder_for, make_sample
-from tofcapture.dataset.truth import view_error
+from tofcapture.dataset.sample import SampleConfig, decoder_for, make_sample, view_error
 from tofcapture.files.seal import sealed_digest
 from tofcapture.files.shard import ShardWriter
 from tofcapture.files.view import read_depth_view

@@ -34,7 +34,7 @@ from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, View
 from tofcapture.poses import exp, invert, look_at, rotation_angle, rotation_exp, transform
 from tofcapture.rig import dumps_rig
-from tofcapture.viz import charts
+from tofcapture.viz import page as charts
 
 CAMERA = Camera(240, 180, 190.6, 200.7, 116.8, 101.5)
 TRUE = exp([0.05, 0.07, 0.004, 0.01, -0.02, 0.01])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError
-from tofcapture.files.info import stereo_table, tof_from, tof_table
+from tofcapture.files.hdf import stereo_table, tof_from, tof_table
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.ops.normals import normals_from_depth
 from tofcapture.ops.phase import Decoder, radial_to_range, taps

@@ -16,7 +16,7 @@ from tests.test_daemon_api import STATION
 from tofcapture.cli import main
 from tofcapture.colours import GREY
 from tofcapture.errors import BusyError, ConfigError, DataError, UsageError
-from tofcapture.record.daemon import preview, settings, store
+from tofcapture.record.daemon import settings, store, worker
 from tofcapture.record.resources import is_full
 
 cv2 = pytest.importorskip("cv2")
@@ -26,13 +26,13 @@ def test_pictures_show_near_far_and_nothing():
     """Near is dark, far is bright, nothing is grey; all nothing and all the same are no errors; large ones are thinned."""
     depth = np.linspace(0.5, 1.5, 100)[None].repeat(4, axis=0)
     depth[:, 50] = np.nan
-    shown = _decoded(preview.picture("depth", depth))
+    shown = _decoded(worker.picture("depth", depth))
     assert shown.shape == (4, 100, 3)
     assert shown[0, 1].sum() < shown[0, 40].sum() < shown[0, 98].sum()
     assert (shown[:, 50] == GREY).all()
-    assert (_decoded(preview.picture("depth", np.full((3, 3), np.nan))) == GREY).all()
-    assert _decoded(preview.picture("amplitude", np.ones((3, 3)))).shape == (3, 3, 3)
-    assert max(_decoded(preview.picture("depth", np.ones((1024, 1280)))).shape) <= 320
+    assert (_decoded(worker.picture("depth", np.full((3, 3), np.nan))) == GREY).all()
+    assert _decoded(worker.picture("amplitude", np.ones((3, 3)))).shape == (3, 3, 3)
+    assert max(_decoded(worker.picture("depth", np.ones((1024, 1280)))).shape) <= 320
 
 
 def _decoded(png):

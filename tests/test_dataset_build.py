@@ -18,8 +18,7 @@ from tests.test_ops_clean import inside
 from tofcapture.cli import main
 from tofcapture.dataset import sample as sampling
 from tofcapture.dataset.build import build_dataset
-from tofcapture.dataset.sample import SampleConfig, decoder_for, masked
-from tofcapture.dataset.truth import pooled, view_error
+from tofcapture.dataset.sample import SampleConfig, decoder_for, masked, pooled, view_error
 from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.light import exact_view
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects

@@ -23,7 +23,7 @@ from tofcapture.colours import Scale
 from tofcapture.frames import View
 from tofcapture.poses import Float64, check_transform, invert, transform
 from tofcapture.rig import SPEED_OF_LIGHT, range_error_from
-from tofcapture.viz import charts
+from tofcapture.viz import page as charts
 from tofcapture.viz.page import write_page
 
 Progress = Callable[[str, int, int], None]

@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture.dataset.card import write_card
-from tofcapture.dataset.sample import SampleConfig
+from tofcapture.dataset.sample import SampleConfig, TruthError, pooled_error
 from tofcapture.dataset.scene import WORK, SceneOutcome, SceneTask, build_scene, versions
 from tofcapture.dataset.split import assign_splits
-from tofcapture.dataset.truth import TruthError, pooled_error
 from tofcapture.errors import ConfigError, DataError, TofError
 from tofcapture.files.layout import BOARD_SCENE
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest

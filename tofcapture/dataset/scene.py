@@ -23,10 +23,18 @@ from typing import Any
 import numpy as np
 
 from tofcapture import __version__
-from tofcapture.dataset.sample import SampleConfig, calibrated, decoder_for, make_sample
-from tofcapture.dataset.truth import TruthError, ViewError, pooled, view_error
+from tofcapture.dataset.sample import (
+    SampleConfig,
+    TruthError,
+    ViewError,
+    calibrated,
+    decoder_for,
+    make_sample,
+    pooled,
+    view_error,
+)
 from tofcapture.errors import DataError, TofError
-from tofcapture.files.info import dumps
+from tofcapture.files.hdf import dumps
 from tofcapture.files.layout import SHARD, MaskBit
 from tofcapture.files.seal import digest_path, sealed_digest
 from tofcapture.files.shard import Sample, ShardReader, ShardWriter

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from tofcapture.devices import Device
 from tofcapture.errors import ConfigError, DeviceError, FormatError
-from tofcapture.files.info import tof_from
+from tofcapture.files.hdf import tof_from
 from tofcapture.files.seal import write_text
 from tofcapture.frames import TofInfo
 

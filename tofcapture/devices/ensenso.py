@@ -23,7 +23,7 @@ from tofcapture.devices.cameras import ReopenedCamera, described, read_descripti
 from tofcapture.devices.host import hosted
 from tofcapture.devices.registry import check_keys
 from tofcapture.errors import ConfigError, DeviceError, FormatError
-from tofcapture.files.info import stereo_from
+from tofcapture.files.hdf import stereo_from
 from tofcapture.frames import StereoFrame, StereoInfo
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from typing import Any
 from tofcapture.devices import Arm, Operator, StereoDevice, TofCamera
 from tofcapture.devices.registry import ROLES, StationContext, make_device
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused, TofError
-from tofcapture.files.info import stereo_table, tof_table
+from tofcapture.files.hdf import stereo_table, tof_table
 from tofcapture.frames import ArmInfo, ArmState
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig, load_rig

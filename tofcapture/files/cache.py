@@ -22,8 +22,7 @@ import numpy as np
 
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError, FormatError
-from tofcapture.files.hdf import Array
-from tofcapture.files.info import tof_from, tof_table
+from tofcapture.files.hdf import Array, tof_from, tof_table
 from tofcapture.files.layout import SPLITS
 from tofcapture.files.manifest import SceneEntry, load_manifest, load_signed, signed_text
 from tofcapture.files.seal import (

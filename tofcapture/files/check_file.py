@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError, TofError
-from tofcapture.files.hdf import Array, json_attr, text_attr
-from tofcapture.files.info import stereo_from, tof_from
+from tofcapture.files.hdf import Array, json_attr, stereo_from, text_attr, tof_from
 from tofcapture.files.layout import LAYOUTS, SHARD, VIEW, Field, Layout, MaskBit
 from tofcapture.files.seal import digest_path, digest_text, sha256_of, stored_digest
 from tofcapture.frames import StereoInfo, TofFlag, TofInfo

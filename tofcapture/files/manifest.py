@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture.errors import DataError, FormatError
-from tofcapture.files.info import dumps
+from tofcapture.files.hdf import dumps
 from tofcapture.files.layout import SPLITS
 from tofcapture.files.seal import write_text
 

@@ -30,8 +30,20 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, FormatError
-from tofcapture.files.hdf import Array, create, find, json_attr, open_checked, read, text_attr, write_attrs
-from tofcapture.files.info import stereo_from, stereo_table, tof_from, tof_table
+from tofcapture.files.hdf import (
+    Array,
+    create,
+    find,
+    json_attr,
+    open_checked,
+    read,
+    stereo_from,
+    stereo_table,
+    text_attr,
+    tof_from,
+    tof_table,
+    write_attrs,
+)
 from tofcapture.files.layout import SHARD, VIEW
 from tofcapture.files.seal import partial_path, remember, remembered, seal, verify
 from tofcapture.files.view import check_scene_name

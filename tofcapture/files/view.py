@@ -19,8 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError, DataError, FormatError, TofError
-from tofcapture.files.hdf import Array, attr, create, fetch, json_attr, open_checked, text_attr, write_attrs
-from tofcapture.files.info import stereo_from, stereo_table, tof_from, tof_table
+from tofcapture.files.hdf import (
+    Array,
+    attr,
+    create,
+    fetch,
+    json_attr,
+    open_checked,
+    stereo_from,
+    stereo_table,
+    text_attr,
+    tof_from,
+    tof_table,
+    write_attrs,
+)
 from tofcapture.files.layout import VIEW
 from tofcapture.files.seal import partial_path, seal
 from tofcapture.frames import ArmState, StereoFrame, TofBurst, Truth, View

@@ -20,11 +20,10 @@ from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 from tofcapture.files.seal import write_text
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, TofBurst, View
-from tofcapture.record.journal import Journal, utc_now
+from tofcapture.record.journal import Journal, reconcile, utc_now
 from tofcapture.record.observer import Observer
 from tofcapture.record.plan import Plan, PlannedView, plan_scene
 from tofcapture.record.quality import REFUSE, RETAKE, broken_limits, measure, quality_table
-from tofcapture.record.reconcile import reconcile
 from tofcapture.record.resources import check_space, full_disk_named, hold_arm, hold_file
 
 ATTEMPTS = 3  # at one view

@@ -14,7 +14,7 @@ from tofcapture.poses import Float64, transform_points
 from tofcapture.record.candidates import REMEDIES
 from tofcapture.record.plan import Plan, PlannedView
 from tofcapture.rig import Rig
-from tofcapture.viz.charts import LINES, canvas, frustum, svg_text
+from tofcapture.viz.page import LINES, canvas, frustum, svg_text
 
 _REACH = 0.12  # m; how long the pyramids are drawn
 _DOTS = 1500  # refused candidates that are drawn, of what there are

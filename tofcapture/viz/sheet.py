@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tofcapture.colours import GOOD, MASK, Scale, UInt8, palette
-from tofcapture.viz.charts import canvas, draw_bars, draw_rig, save
+from tofcapture.viz.page import canvas, draw_bars, draw_rig, save
 from tofcapture.viz.shots import Panel, Shot, Source, scales_of
 
 NORMAL_KEY = ((None, "red right, green up,"), (None, "blue towards the camera"))

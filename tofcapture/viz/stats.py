@@ -8,8 +8,15 @@ from typing import Any
 from tofcapture.colours import NORMAL_WORDS, Scale
 from tofcapture.dataset.stats import QUANTITIES, STANDS_OUT, DatasetStats, Quantity
 from tofcapture.files.manifest import load_manifest
-from tofcapture.viz.charts import lines
-from tofcapture.viz.page import Picture, map_picture, mask_legend, mask_picture, normal_picture, write_page
+from tofcapture.viz.page import (
+    Picture,
+    lines,
+    map_picture,
+    mask_legend,
+    mask_picture,
+    normal_picture,
+    write_page,
+)
 from tofcapture.viz.shots import scales_of
 from tofcapture.viz.sources import shard_shot
 

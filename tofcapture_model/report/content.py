@@ -18,7 +18,7 @@ from tofcapture.files.manifest import Manifest
 from tofcapture.files.shard import ShardReader
 from tofcapture.poses import Float64, invert, rotation_log
 from tofcapture.rig import RangeError, Rig
-from tofcapture.viz.charts import chart, draw_rig, lines
+from tofcapture.viz.page import chart, draw_rig, lines
 from tofcapture_model.config import dumps_config
 from tofcapture_model.evaluation.tables import RANKS, Column, column_cells, value_of
 from tofcapture_model.report.examples import METHOD_TITLES, choose, load_examples, panels

@@ -16,10 +16,10 @@ from aiohttp import web
 
 from tofcapture import __version__
 from tofcapture.errors import UsageError
-from tofcapture.record.daemon.events import Streams
 from tofcapture.record.daemon.guard import BODY_LIMIT, Guard, Handler, body_of
-from tofcapture.record.daemon.preview import NAMES
+from tofcapture.record.daemon.store import Streams
 from tofcapture.record.daemon.supervisor import Supervisor
+from tofcapture.record.daemon.worker import NAMES
 
 PAGE = Path(__file__).with_name("page")
 PAGE_FILES = {

@@ -19,10 +19,9 @@ from aiohttp.http_exceptions import HttpProcessingError
 
 from tofcapture.errors import BusyError, ConfigError, UsageError
 from tofcapture.record.daemon.app import PAGE_FILES, Api
-from tofcapture.record.daemon.events import Streams
 from tofcapture.record.daemon.guard import Guard
 from tofcapture.record.daemon.settings import Settings, StateFolder, only_one, token_of
-from tofcapture.record.daemon.store import Store
+from tofcapture.record.daemon.store import Store, Streams
 from tofcapture.record.daemon.supervisor import Supervisor
 
 _BACKLOG = 512

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tofcapture.errors import UsageError
-from tofcapture.viz.charts import METADATA, canvas, save
+from tofcapture.viz.page import METADATA, canvas, save
 
 
 @dataclass(frozen=True)

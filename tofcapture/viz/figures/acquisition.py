@@ -16,7 +16,7 @@ from tofcapture.files.layout import BOARD_SCENE, VIEW
 from tofcapture.files.view import read_view
 from tofcapture.poses import Float64, transform_points
 from tofcapture.rig import Rig
-from tofcapture.viz.charts import STEREO, TOF, draw_rig, frustum
+from tofcapture.viz.page import STEREO, TOF, draw_rig, frustum
 from tofcapture.viz.sheet import FONT, SMALL, WIDTH, Cell, draw_bar, draw_cell
 from tofcapture.viz.shots import Shot, scales_of
 from tofcapture.viz.sources import arm_of, links_of, number_of, pick_view, rig_of, scene_views, view_shot
