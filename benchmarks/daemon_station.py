@@ -289,7 +289,7 @@ def worker(station: str) -> None:
 
 def daemon(args: argparse.Namespace) -> None:
     """Run a daemon whose recorder is :func:`worker`."""
-    from tofcapture.record.daemon import server as guard
+    from tofcapture.record.daemon import guard
     from tofcapture.record.daemon.server import serve, tcp_address
     from tofcapture.record.daemon.settings import Settings, open_folder
 

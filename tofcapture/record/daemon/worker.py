@@ -180,8 +180,6 @@ class DaemonLink(Observer):
 
     def sealed(self, view: View, sha256: str) -> None:
         """Tell what a view is like; pictures that cannot be made are no reason to lose a recording."""
-        from tofcapture.record.daemon.worker import quality, save
-
         found: dict[str, Any] = {}
         try:
             save(view, self._previews)
