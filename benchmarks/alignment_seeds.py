@@ -25,8 +25,8 @@ from calibration.alignment.averages import about, average_transforms, fuse, twis
 from calibration.alignment.joint import joint_icp
 from calibration.alignment.methods import alignment_error
 from calibration.alignment.views import joint_view_of
-from calibration.registration.backends import register
 from calibration.registration.clouds import WORKING_DEPTH, Cloud, tof_depth
+from calibration.registration.gate import register
 from tofcapture.devices.sim import stereo as stereos
 from tofcapture.devices.sim.config import Constants, read_constants
 from tofcapture.devices.sim.light import Light

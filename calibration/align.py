@@ -9,7 +9,7 @@ from calibration.alignment.diagnosis import check_start, explained
 from calibration.alignment.methods import apply_method, method_named
 from calibration.alignment.rounds import Progress, RefusedPairsError, demand_pairs, solve
 from calibration.evidence import evidence_of, write_json
-from calibration.registration.backends import backend_named
+from calibration.registration.gate import backend_named
 from calibration.registration.pairs import Pair, calibration_views, load_pair
 from tofcapture.errors import DataError
 from tofcapture.files.seal import write_text

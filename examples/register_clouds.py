@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.registration.backends import register
 from calibration.registration.clouds import stereo_cloud, surface_points, tof_depth
+from calibration.registration.gate import register
 from tofcapture.files.view import read_view
 from tofcapture.poses import invert, rotation_angle
 

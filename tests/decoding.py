@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
+from tofcapture.ops.phase.decoder import centred, unwrap, unwrap_spatial
 from tofcapture.ops.phase.phasors import Complex128, Float64, ambiguity, frequencies, wrapped_range
-from tofcapture.ops.phase.unwrapping import centred, unwrap, unwrap_spatial
 from tofcapture.rig import RangeError, image_places, radius_px
 
 _STEPS, _SETTLED = 20, 1e-8  # of the fixed point, m

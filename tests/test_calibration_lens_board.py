@@ -11,7 +11,7 @@ import pytest
 from calibration.board.fit import Model, clear_of_walls
 from calibration.board.geometry import load_board
 from calibration.cli.sensor import lens_report, lens_table
-from calibration.lens.fit import BoardSeen, fit_lens, fit_lens_to_board
+from calibration.lens import BoardSeen, fit_lens, fit_lens_to_board
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.cli import main

@@ -14,8 +14,15 @@ import pytest
 from calibration.board.detector import BoardRefusal, detect, stereo_sight, tof_sight
 from calibration.board.geometry import load_board
 from calibration.cli.align import _page
-from calibration.evidence import judged_evidence, read_evidence
-from calibration.evidence.compare import OldRig, drift, drift_text, load_old, uncertainty
+from calibration.evidence import (
+    OldRig,
+    drift,
+    drift_text,
+    judged_evidence,
+    load_old,
+    read_evidence,
+    uncertainty,
+)
 from calibration.evidence.page import (
     Samples,
     image_medians,

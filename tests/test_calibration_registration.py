@@ -7,9 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.registration.backends import BACKENDS, backend_named, register
 from calibration.registration.clouds import Cloud
-from calibration.registration.gate import Refusal, check_registration, measure_registration
+from calibration.registration.gate import (
+    BACKENDS,
+    Refusal,
+    backend_named,
+    check_registration,
+    measure_registration,
+    register,
+)
 from tofcapture import poses
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.libraries import load_open3d

@@ -14,9 +14,9 @@ from tests.test_dataset_card import make
 from tests.test_files_shard import write
 from tofcapture.camera import Camera
 from tofcapture.cli import main
+from tofcapture.colours import png_bytes
 from tofcapture.dataset.export import UNIT, export
 from tofcapture.errors import ConfigError, DataError, FormatError
-from tofcapture.files.png import png_bytes
 from tofcapture.files.shard import ShardReader
 from tofcapture.libraries import load_open3d
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tofcapture.dataset.split import TINY, assign_splits
-from tofcapture.files.manifest import object_of
+from tofcapture.files.manifest import TINY, assign_splits, object_of
 
 STEMS = st.sampled_from(
     ["mug", "box", "gear", "random", "text", "blob", "tool", "plate", "cup", "bowl", "steps", "stack"]

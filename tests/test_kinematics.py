@@ -17,7 +17,7 @@ from tofcapture.devices.kinematics import (
 )
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.sim.drivers import SimArm
-from tofcapture.devices.sim.faults import FaultPlan, Faults
+from tofcapture.devices.sim.world import FaultPlan, Faults
 from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.poses import check_transform, rotation_angle, transform
 

@@ -15,8 +15,7 @@ from tofcapture.errors import ConfigError
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.config import BASELINES, Config, Losses, Stage, loads_config, preset
 from tofcapture_model.frame import Target
-from tofcapture_model.geometry.intrinsics import rays
-from tofcapture_model.geometry.maps import metres_per_radian, turn
+from tofcapture_model.geometry.maps import metres_per_radian, rays, turn
 from tofcapture_model.networks import build_model, select_stage, training_loss
 from tofcapture_model.networks.baselines import Baseline, decode, lf2, upsample_depth
 from tofcapture_model.networks.baselines.coarse_fine import CoarseFine

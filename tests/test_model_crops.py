@@ -12,8 +12,7 @@ from tests.test_model_baselines import target
 from tests.test_model_networks import frame
 from tofcapture_model.data import FrameDataset, crop, mirror
 from tofcapture_model.frame import Frame, Target
-from tofcapture_model.geometry.intrinsics import scale_intrinsics
-from tofcapture_model.geometry.maps import unproject
+from tofcapture_model.geometry.maps import scale_intrinsics, unproject
 
 H, W = 36, 44
 

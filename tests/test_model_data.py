@@ -29,8 +29,7 @@ from tofcapture_model.data import (
     spare_memory,
 )
 from tofcapture_model.data.raw_input import NOMINAL_CAMERA
-from tofcapture_model.geometry.intrinsics import scale_intrinsics
-from tofcapture_model.geometry.maps import depth_to_normals
+from tofcapture_model.geometry.maps import depth_to_normals, scale_intrinsics
 from tofcapture_model.networks.checkpoint import load_model
 
 

@@ -13,11 +13,12 @@ from torch import nn
 
 from tofcapture.camera import Camera
 from tofcapture_model.evaluation.metrics import angles_deg
-from tofcapture_model.geometry.intrinsics import rays, scale_intrinsics
 from tofcapture_model.geometry.maps import (
     depth_to_normals,
     local_planes,
     propagate_depth,
+    rays,
+    scale_intrinsics,
     shifted,
     side_window_planes,
     unit,

@@ -16,8 +16,14 @@ from tests.test_model_networks import TINY_COMPACT, frame
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.evaluation.metrics import angles_deg
 from tofcapture_model.geometry import multipath
-from tofcapture_model.geometry.intrinsics import rays, scale_intrinsics
-from tofcapture_model.geometry.maps import doubled_parts, local_planes, side_window_planes, unit
+from tofcapture_model.geometry.maps import (
+    doubled_parts,
+    local_planes,
+    rays,
+    scale_intrinsics,
+    side_window_planes,
+    unit,
+)
 from tofcapture_model.geometry.multipath import STEP, cues, exchange_error, halo_error, surface
 from tofcapture_model.networks.heads import (
     CUE_SCALE,

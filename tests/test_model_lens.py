@@ -25,17 +25,19 @@ from tofcapture_model.data import FrameDataset, collate, crop, frame_decoder, mi
 from tofcapture_model.data.raw_input import NOMINAL_CAMERA
 from tofcapture_model.evaluation.evaluate import evaluate
 from tofcapture_model.geometry.decoder import TorchDecoder
-from tofcapture_model.geometry.intrinsics import (
+from tofcapture_model.geometry.maps import (
     cut_intrinsics,
+    depth_to_normals,
     expect_usable,
     intrinsics_of,
     mirror_intrinsics,
+    propagate_depth,
     rays,
     scale_intrinsics,
     thin_intrinsics,
+    unproject,
     with_lens,
 )
-from tofcapture_model.geometry.maps import depth_to_normals, propagate_depth, unproject
 from tofcapture_model.geometry.multipath import _patches, cues
 from tofcapture_model.inference import onnx_backend
 from tofcapture_model.inference import predict as predicting

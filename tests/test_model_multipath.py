@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.geometry import multipath
-from tofcapture_model.geometry.intrinsics import rays
+from tofcapture_model.geometry.maps import rays
 from tofcapture_model.geometry.multipath import SIGNAL, cues, exchange_error, halo_error, surface
 
 K = torch.tensor([[90.0, 90.0, 59.5, 44.5]])

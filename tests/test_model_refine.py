@@ -9,8 +9,7 @@ torch = pytest.importorskip("torch")
 
 from tests.test_model_geometry import CAMERA, intrinsics, plane
 from tests.test_model_networks import TINY_COMPACT, frame, joint
-from tofcapture_model.geometry.intrinsics import scale_intrinsics
-from tofcapture_model.geometry.maps import depth_to_normals, propagate_depth, unit
+from tofcapture_model.geometry.maps import depth_to_normals, propagate_depth, scale_intrinsics, unit
 from tofcapture_model.losses import MIN_ERROR
 from tofcapture_model.networks.heads import Refinement
 

@@ -28,7 +28,7 @@ from tofcapture_model.data import make_target
 from tofcapture_model.evaluation.measures import Precision, Uncertainty, regions
 from tofcapture_model.evaluation.suite import averaged, read_weights
 from tofcapture_model.evaluation.tables import SUITES, cells
-from tofcapture_model.geometry.intrinsics import rays, scale_intrinsics
+from tofcapture_model.geometry.maps import rays, scale_intrinsics
 from tofcapture_model.inference.predict import predict
 from tofcapture_model.losses import error_map_loss, laplace_loss, reweighting
 from tofcapture_model.networks import build_model, training_loss

@@ -8,8 +8,8 @@ from tofcapture.devices.clearance import stage_of
 from tofcapture.devices.kinematics import MODELS
 from tofcapture.devices.station import read_station
 from tofcapture.poses import look_at, rotation_exp, transform
-from tofcapture.record.board_meter import SECTORS, lean_of, meter
 from tofcapture.record.plan import board_sampling, plan_views
+from tofcapture.record.quality import SECTORS, lean_of, meter
 from tofcapture.rig import Rig
 
 CAMERA = Camera(240, 180, 190.0, 200.0, 119.5, 89.5)

@@ -7,8 +7,7 @@ from tests.test_sim_world import SMALL
 from tofcapture.devices.kinematics import HOME
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.sim.drivers import SimArm, SimStereo, SimTof
-from tofcapture.devices.sim.faults import FaultPlan, Faults, read_faults
-from tofcapture.devices.sim.world import shared_world
+from tofcapture.devices.sim.world import FaultPlan, Faults, read_faults, shared_world
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 
 GOAL = HOME + 0.01

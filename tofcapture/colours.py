@@ -2,11 +2,15 @@
 
 Depth is viridis, amplitude cividis, signed error red-white-blue with white at zero, unsigned errors magma. Grey is no
 value. Masks and clouds use the palette of Okabe and Ito (2008), which colour-blind readers can tell apart.
+
+Images are encoded here as PNG too: 8 or 16 bits, with text or a colour table.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -166,3 +170,46 @@ def percentile(values: Sequence[NDArray[Any]], share: float, default: float) -> 
     """Percentile (0 to 100) of everything finite in some arrays; a default where nothing is."""
     flat = np.concatenate([np.ravel(v)[np.isfinite(np.ravel(v))] for v in values] or [np.zeros(0)])
     return float(np.percentile(flat, share)) if flat.size else default
+
+
+_NONE, _UP = 0, 2  # PNG's filters; the difference to the row above suits smooth surfaces
+_GREY, _COLOUR, _INDEXED = 0, 2, 3
+
+
+def png_bytes(
+    image: NDArray[Any],
+    text: Mapping[str, str] | None = None,
+    colours: NDArray[np.uint8] | None = None,
+    level: int = 6,
+) -> bytes:
+    """Encode an image; the same input gives the same bytes.
+
+    Parameters
+    ----------
+    image
+        Grey (H, W) of uint8 or uint16, colours (H, W, 3) of uint8, or indices (H, W) of uint8 into ``colours``.
+    text
+        Text chunks, Latin-1.
+    colours
+        (256, 3) colour table.
+    level
+        Of compression, 0 to 9.
+    """
+    H, W = image.shape[:2]
+    rows = image.astype(image.dtype.newbyteorder(">")).reshape(H, -1).view(np.uint8)
+    filtered = _NONE if colours is not None else _UP
+    if filtered == _UP:
+        rows = rows - np.vstack([np.zeros_like(rows[:1]), rows[:-1]])
+    lines = np.hstack([np.full((H, 1), filtered, np.uint8), rows])
+    kind = _COLOUR if image.ndim == 3 else _GREY if colours is None else _INDEXED
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", W, H, 8 * image.dtype.itemsize, kind, 0, 0, 0))]
+    parts += [
+        (b"tEXt", key.encode("latin-1") + b"\0" + value.encode("latin-1"))
+        for key, value in (text or {}).items()
+    ]
+    parts += [] if colours is None else [(b"PLTE", colours.tobytes())]
+    parts += [(b"IDAT", zlib.compress(lines.tobytes(), level)), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in parts
+    )

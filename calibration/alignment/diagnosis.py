@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from calibration.alignment.rounds import RefusedPairsError
-from calibration.registration.backends import register
 from calibration.registration.clouds import WORKING_DEPTH, Cloud
-from calibration.registration.gate import Refusal, check_registration
+from calibration.registration.gate import Refusal, check_registration, register
 from calibration.registration.pairs import Pair
 from tofcapture.errors import ConfigError, DataError, QualityError, TofError
 from tofcapture.files.view import read_view

@@ -16,11 +16,13 @@ import numpy as np
 
 from calibration.alignment.averages import Average, average_transforms
 from calibration.range_error.terms import SIMPLE, Terms
-from calibration.registration.backends import COARSE_TO_FINE, FINE, register
 from calibration.registration.gate import (
+    COARSE_TO_FINE,
+    FINE,
     Refusal,
     Registration,
     check_registration,
+    register,
     residuals,
     tukey_weights,
 )

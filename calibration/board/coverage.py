@@ -19,7 +19,7 @@ from tofcapture.devices.clearance import stage_of
 from tofcapture.errors import DataError
 from tofcapture.files.view import read_view
 from tofcapture.poses import Float64, invert, transform, transform_points
-from tofcapture.record.board_meter import CELLS, SECTORS, TILTED, TILTS
+from tofcapture.record.quality import CELLS, SECTORS, TILTED, TILTS
 
 
 def coverage(poses: Sequence[Float64], camera: Camera, outline: Float64) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from tofcapture.cli.kit import Command, Outcome
 from tofcapture.errors import ConfigError
 
 if TYPE_CHECKING:
-    from calibration.evidence.compare import OldRig
+    from calibration.evidence import OldRig
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +36,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> Outcome:
     from calibration.align import align
-    from calibration.evidence.compare import drift, drift_table, drift_text, load_old
+    from calibration.evidence import drift, drift_table, drift_text, load_old
     from tofcapture.rig import load_rig, rig_to_dict
 
     initial = None if args.initial is None else load_rig(args.initial)

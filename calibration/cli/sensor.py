@@ -18,7 +18,7 @@ from tofcapture.poses import Float64
 
 if TYPE_CHECKING:
     from calibration.board.geometry import Board
-    from calibration.lens.fit import BoardLens, BoardSeen
+    from calibration.lens import BoardLens, BoardSeen
     from calibration.phase_order.find import PhaseOrder
     from calibration.range_error.fit import RangeFit
     from tofcapture.camera import Camera
@@ -84,7 +84,7 @@ def run_lens(args: argparse.Namespace) -> Outcome:
     """Fit the lens, write it into ``rig.toml`` and ``lens.json``."""
     from calibration.board.fit import Model
     from calibration.board.geometry import load_board
-    from calibration.lens.fit import fit_lens
+    from calibration.lens import fit_lens
 
     board, rig = load_board(args.board), believed_rig(args.recording)
 
@@ -105,7 +105,7 @@ def run_lens(args: argparse.Namespace) -> Outcome:
 def board_seen(view: View, camera: Camera, board: Board) -> BoardSeen:
     """Find the board with the believed lens, or say why not; keep its rims as pixels, which no lens has touched."""
     from calibration.board.detector import NEAR_PLANE, detect, tof_sight
-    from calibration.lens.fit import BoardSeen
+    from calibration.lens import BoardSeen
 
     sight = tof_sight(replace(view.tof, info=replace(view.tof.info, camera=camera)))
     T = detect(sight, board, camera).T_camera_board
@@ -115,7 +115,7 @@ def board_seen(view: View, camera: Camera, board: Board) -> BoardSeen:
 
 def lens_report(fit: BoardLens, rig: Rig) -> dict[str, Any]:
     """Lay a fit out as JSON types."""
-    from calibration.lens.fit import NAMES, lens_values
+    from calibration.lens import NAMES, lens_values
     from calibration.limits import LENS, worst
 
     judged = {

@@ -11,8 +11,7 @@ import numpy as np
 
 from calibration.alignment.rounds import free_of
 from calibration.board.coverage import coverage
-from calibration.evidence import covariance_of, read_evidence
-from calibration.evidence.compare import Drift, OldRig, drift
+from calibration.evidence import Drift, OldRig, covariance_of, drift, read_evidence
 from calibration.limits import LIMITS, Judged, judged, worst
 from calibration.registration.clouds import stereo_cloud, surface_points, tof_depth
 from calibration.registration.gate import residuals

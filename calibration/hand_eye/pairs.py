@@ -20,9 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.hand_eye.checks import Cause, HandEyeRefused, clean, thinned
 from calibration.hand_eye.closed_form import invert_all
 from calibration.hand_eye.refine import refined_from_consensus
-from calibration.registration.backends import FINE, register
 from calibration.registration.clouds import Cloud, stereo_cloud
-from calibration.registration.gate import Refusal, check_registration
+from calibration.registration.gate import FINE, Refusal, check_registration, register
 from calibration.registration.pairs import calibration_views
 from calibration.registration.rims import REPEAT, rim_cloud, stereo_rims
 from tofcapture.errors import DataError, QualityError

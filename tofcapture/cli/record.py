@@ -94,7 +94,7 @@ class _BoardMeter(Observer):
     def sealed(self, view: View, sha256: str) -> None:
         """Print the meter."""
         from tofcapture.devices.clearance import stage_of
-        from tofcapture.record.board_meter import meter
+        from tofcapture.record.quality import meter
 
         del sha256
         self._there.append(view.index)

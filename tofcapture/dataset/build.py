@@ -18,10 +18,9 @@ from typing import Any
 from tofcapture.dataset.card import write_card
 from tofcapture.dataset.sample import SampleConfig, TruthError, pooled_error
 from tofcapture.dataset.scene import WORK, SceneOutcome, SceneTask, build_scene, versions
-from tofcapture.dataset.split import assign_splits
 from tofcapture.errors import ConfigError, DataError, TofError
 from tofcapture.files.layout import BOARD_SCENE
-from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
+from tofcapture.files.manifest import Manifest, SceneEntry, assign_splits, write_manifest
 from tofcapture.files.seal import PARTIAL
 from tofcapture.files.shard import ShardReader
 from tofcapture.files.view import read_depth_view

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
+from tofcapture.colours import png_bytes
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.layout import MASK_DOCS
 from tofcapture.files.manifest import load_manifest, load_signed, signed_text
-from tofcapture.files.png import png_bytes
 from tofcapture.files.seal import replacing, sealed_digest, sha256_of, write_text
 from tofcapture.files.shard import ShardReader
 from tofcapture.poses import Float64

@@ -28,9 +28,9 @@ from tofcapture.colours import (
     mask_colours,
     paint_normals,
     palette,
+    png_bytes,
 )
 from tofcapture.errors import ConfigError
-from tofcapture.files.png import png_bytes
 from tofcapture.files.seal import replacing, write_text
 from tofcapture.poses import Float64, invert, transform_points
 from tofcapture.rig import Rig

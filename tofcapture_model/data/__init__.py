@@ -27,7 +27,7 @@ from tofcapture.ops.phase.float32 import tap_weights
 from tofcapture_model.data.augment import BurstNoise
 from tofcapture_model.data.raw_input import taken
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, NO_MAPS, Frame, Target
-from tofcapture_model.geometry.intrinsics import (
+from tofcapture_model.geometry.maps import (
     cut_intrinsics,
     expect_usable,
     intrinsics_of,

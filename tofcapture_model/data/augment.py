@@ -12,8 +12,7 @@ from torch import Tensor
 
 from tofcapture.ops.phase import TapNoise
 from tofcapture_model.frame import Frame
-from tofcapture_model.geometry.intrinsics import rays
-from tofcapture_model.geometry.maps import metres_per_radian, turn
+from tofcapture_model.geometry.maps import metres_per_radian, rays, turn
 
 _ORDERS = (0, 2, 4)  # of the phase: offset, and the wiggling of sensors with four phases
 

@@ -9,8 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.frame import Frame, Target
-from tofcapture_model.geometry.intrinsics import scale_intrinsics
-from tofcapture_model.geometry.maps import unproject
+from tofcapture_model.geometry.maps import scale_intrinsics, unproject
 
 EDGE_BAND = 5  # px at the output resolution, on either side of a step
 EDGE_STEP = 0.03  # m between a pixel and its neighbour's plane

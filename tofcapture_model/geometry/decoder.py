@@ -22,7 +22,7 @@ from tofcapture.ops.phase.decoder import UNKNOWN_CELSIUS
 from tofcapture.ops.phase.float32 import Correction, tap_weights
 from tofcapture.rig import RangeError
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
-from tofcapture_model.geometry.intrinsics import expect_usable, intrinsics_of
+from tofcapture_model.geometry.maps import expect_usable, intrinsics_of
 
 _HELD = 1 << 25  # elements of the table of distances
 

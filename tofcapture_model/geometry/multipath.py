@@ -12,8 +12,13 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture.rig import SPEED_OF_LIGHT
-from tofcapture_model.geometry.intrinsics import pixel_slopes, rays, thin_intrinsics
-from tofcapture_model.geometry.maps import plane_normals, side_window_planes
+from tofcapture_model.geometry.maps import (
+    pixel_slopes,
+    plane_normals,
+    rays,
+    side_window_planes,
+    thin_intrinsics,
+)
 
 SIGNAL = 0.04  # of saturation: amplitude of a white patch that faces the sensor at 1 m; networks correct it by a factor
 STEP = 10  # pixels per patch

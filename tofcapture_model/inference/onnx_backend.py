@@ -13,7 +13,7 @@ from tofcapture.errors import ConfigError
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Config, loads_config
 from tofcapture_model.frame import Frame
-from tofcapture_model.geometry.intrinsics import LENS, with_lens
+from tofcapture_model.geometry.maps import LENS, with_lens
 
 OUTPUTS = ("depth_2x", "normals_2x", "error_2x")
 DIGEST, CONFIG = "weights_sha256", "config.toml"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.files.png import png_bytes
+from tofcapture.colours import png_bytes
 from tofcapture.files.seal import write_text
 
 Float32 = NDArray[np.float32]

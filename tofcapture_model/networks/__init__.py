@@ -12,7 +12,7 @@ from torch import nn
 from tofcapture.errors import ConfigError
 from tofcapture_model.config import Config, Losses
 from tofcapture_model.frame import Estimate, Frame, Target
-from tofcapture_model.geometry.intrinsics import scale_intrinsics
+from tofcapture_model.geometry.maps import scale_intrinsics
 from tofcapture_model.losses import Objective, objective
 from tofcapture_model.networks.baselines import Baseline
 from tofcapture_model.networks.baselines.coarse_fine import CoarseFine

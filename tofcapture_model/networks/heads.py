@@ -15,13 +15,13 @@ from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.config import SOURCES, Network
 from tofcapture_model.frame import Frame, expect_channels
-from tofcapture_model.geometry.intrinsics import rays
 from tofcapture_model.geometry.maps import (
     depth_to_normals,
     doubled_parts,
     local_planes,
     plane_normals,
     propagate_depth,
+    rays,
     side_window_planes,
     unit,
 )

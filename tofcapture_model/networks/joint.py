@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from tofcapture_model.config import Network
 from tofcapture_model.frame import Estimate, Frame
-from tofcapture_model.geometry.intrinsics import scale_intrinsics
+from tofcapture_model.geometry.maps import scale_intrinsics
 from tofcapture_model.networks.heads import (
     CUE_SCALE,
     CompactInputs,

@@ -6,20 +6,20 @@ complex number ``A exp(i phi)``. Bursts are averaged as phasors, never as phases
 :class:`Decoder` turns taps into depth at more than a thousand frames a second.
 """
 
-from tofcapture.ops.phase.decoder import Decoder, DepthMaps, Signals, flying_pixels
-from tofcapture.ops.phase.noise import TapNoise, photon_transfer
+from tofcapture.ops.phase.decoder import Decoder, DepthMaps, Signals, flying_pixels, unwrap, unwrap_spatial
 from tofcapture.ops.phase.phasors import (
     Complex128,
     Float64,
+    TapNoise,
     ambiguity,
     frequencies,
     mean_phasors,
     phasors,
+    photon_transfer,
     radial_to_range,
     taps,
     wrapped_range,
 )
-from tofcapture.ops.phase.unwrapping import unwrap, unwrap_spatial
 from tofcapture.rig import radius_px
 
 __all__ = [

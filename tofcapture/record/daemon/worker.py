@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.colours import Kind, scale_for
-from tofcapture.files.png import png_bytes
+from tofcapture.colours import Kind, png_bytes, scale_for
 from tofcapture.files.seal import replacing
 from tofcapture.frames import View
 from tofcapture.ops.phase import Decoder

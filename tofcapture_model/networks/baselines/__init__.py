@@ -13,8 +13,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.frame import Estimate, Frame, Target
-from tofcapture_model.geometry.intrinsics import rays, scale_intrinsics
-from tofcapture_model.geometry.maps import depth_to_normals, metres_per_radian, shifted, turn
+from tofcapture_model.geometry.maps import (
+    depth_to_normals,
+    metres_per_radian,
+    rays,
+    scale_intrinsics,
+    shifted,
+    turn,
+)
 
 NORMAL_RADIUS = 4
 NEAREST = 0.05  # m
