@@ -143,8 +143,7 @@ def _finish(
     """Write manifest and card over all scenes."""
     from tofcapture.dataset.card import write_card
     from tofcapture.dataset.sample import pooled_error
-    from tofcapture.files.manifest import assign_splits
-    from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
+    from tofcapture.files.manifest import Manifest, SceneEntry, assign_splits, write_manifest
 
     splits = assign_splits([m.scene for m in scenes], {m.scene: m.objects for m in scenes})
     splits = splits if split is None else dict.fromkeys(splits, split)
