@@ -23,8 +23,7 @@ from tofcapture_model.config import preset
 from tofcapture_model.data import batched, frame_decoder, make_frame
 from tofcapture_model.data.raw_input import NOMINAL_CAMERA, RawInput
 from tofcapture_model.frame import Frame, frame_to
-from tofcapture_model.inference.export import export
-from tofcapture_model.inference.onnx_backend import ask_onnx, open_onnx
+from tofcapture_model.inference.export import ask_onnx, export, open_onnx
 from tofcapture_model.inference.predict import Ask, has_bfloat16, predict_raw, recorded, torch_model
 from tofcapture_model.networks import build_model
 from tofcapture_model.networks.checkpoint import find_model, load_model, save_model

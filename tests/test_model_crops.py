@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from tests.test_model_baselines import target
 from tests.test_model_networks import frame
-from tofcapture_model.data import FrameDataset, crop, mirror
+from tofcapture_model.data import crop, crop_about_object, mirror
 from tofcapture_model.frame import Frame, Target
 from tofcapture_model.geometry.maps import scale_intrinsics, unproject
 
@@ -63,9 +63,7 @@ def test_crops_are_taken_about_the_object():
     good = torch.zeros_like(truth.good)
     good[..., 40:56, 24:40] = True
     data, truth = Frame(*(x[0] for x in data)), Target(*(x[0] for x in truth._replace(good=good)))
-    cutter = FrameDataset.__new__(FrameDataset)
-    cutter.size = (32, 32)
-    seen = [cutter._cropped(data, truth, np.random.default_rng(i))[1].good for i in range(200)]
+    seen = [crop_about_object(data, truth, (32, 32), np.random.default_rng(i))[1].good for i in range(200)]
     assert np.mean([bool(x.any()) for x in seen]) >= 0.95
     rows = [float(x[0].nonzero()[:, 0].float().mean()) for x in seen if x.any()]
     assert np.std(rows) > 8

@@ -38,8 +38,8 @@ from tofcapture_model.geometry.maps import (
     unproject,
     with_lens,
 )
-from tofcapture_model.geometry.multipath import _patches, cues
-from tofcapture_model.inference import onnx_backend
+from tofcapture_model.geometry.multipath import cues, patches
+from tofcapture_model.inference import export as exporting
 from tofcapture_model.inference import predict as predicting
 from tofcapture_model.inference.predict import Predictor, predict
 from tofcapture_model.training.train import train
@@ -210,7 +210,7 @@ def test_expected_interreflection_does_not_depend_on_the_lens():
 
 def test_patches_have_the_size_that_the_lens_gives_them():
     """Rays and areas of every tenth pixel are those of the camera's own rays; beyond the border both go on straight, as a pinhole's do everywhere."""
-    r, density = _patches(thin_intrinsics(numbers(LENS), 10), 9, 12, 3)
+    r, density = patches(thin_intrinsics(numbers(LENS), 10), 9, 12, 3)
     whole = torch.tensor(LENS.rays[..., :2])
     along_u = (whole[5::10, 6::10] - whole[5::10, 4:-2:10]) * 5
     along_v = (whole[6::10, 5::10] - whole[4:-2:10, 5::10]) * 5
@@ -226,7 +226,7 @@ def test_patches_have_the_size_that_the_lens_gives_them():
     np.testing.assert_allclose(-step, along_u[3, 0], rtol=5e-3, atol=2e-4)
     step = r[0, :2, 2, 6] - r[0, :2, 3, 6]
     np.testing.assert_allclose(-step, along_v[0, 3], rtol=5e-3, atol=2e-4)
-    plain, _ = _patches(thin_intrinsics(numbers(PLAIN), 10), 9, 12, 3)
+    plain, _ = patches(thin_intrinsics(numbers(PLAIN), 10), 9, 12, 3)
     shifted = cut_intrinsics(thin_intrinsics(numbers(PLAIN), 10), -3, -3)
     torch.testing.assert_close(plain, rays(shifted, 15, 18), atol=1e-6, rtol=0)
 
@@ -347,8 +347,8 @@ def test_an_export_made_before_lenses_were_known_says_what_to_do(tmp_path, monke
 
     weights = save_network(tmp_path, preset("demo"))
     weights.with_suffix(".onnx").write_bytes(b"")
-    monkeypatch.setattr(onnx_backend, "open_onnx", lambda _: Old())
-    monkeypatch.setattr(onnx_backend, "config_of", lambda *_: preset("demo"))
+    monkeypatch.setattr(exporting, "open_onnx", lambda _: Old())
+    monkeypatch.setattr(exporting, "config_of", lambda *_: preset("demo"))
     ask = Predictor(weights, backend="onnx")
     assert ask(wall(SMALL), TofInfo("t", "", SMALL, np.zeros(3))).depth.shape == (72, 96)
     lens = replace(SMALL, distortion=(-0.1, 0.02, 0.001, 0.002, 0.0))

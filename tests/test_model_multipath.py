@@ -10,9 +10,8 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from tofcapture.rig import SPEED_OF_LIGHT
-from tofcapture_model.geometry import multipath
-from tofcapture_model.geometry.maps import rays
-from tofcapture_model.geometry.multipath import SIGNAL, cues, exchange_error, halo_error, surface
+from tofcapture_model.geometry.maps import rays, thin_intrinsics
+from tofcapture_model.geometry.multipath import SIGNAL, cues, exchange_error, halo_error, patches, surface
 
 K = torch.tensor([[90.0, 90.0, 59.5, 44.5]])
 SHAPE = (90, 120)
@@ -48,24 +47,20 @@ def test_a_corner_looks_deeper_and_a_wall_does_not():
     assert flat.abs().max() < 0.1 * errors[1]
 
 
-def test_patches_are_as_large_and_as_white_as_the_wall_that_they_are_of(monkeypatch):
-    """Over the whole image, and beyond its border, where the wall goes on."""
-    seen = []
-    transfer = multipath._transfer
-
-    def spy(p, n, area, k):
-        seen.append(area)
-        return transfer(p, n, area, k)
-
-    monkeypatch.setattr(multipath, "_transfer", spy)
+def test_a_facing_wall_is_as_white_as_it_is_and_patches_as_large_as_they_are():
+    """The albedo is that of the wall all over the image; larger patches of a corner send as much light as smaller ones."""
     z, r = 0.8, rays(K, *SHAPE)
     distance = z * r.norm(dim=1, keepdim=True)
     amplitude = 0.5 * SIGNAL * (z / distance) / distance.square()
     wall = torch.full((1, 1, *SHAPE), z)
     maps = surface(wall, torch.ones_like(wall), amplitude, K)
     torch.testing.assert_close(maps[:, 4], torch.full_like(maps[:, 4], 0.5), rtol=0.02, atol=0)
-    exchange_error(maps, K, HZ, step=10, margin=3)
-    torch.testing.assert_close(seen[0], torch.full_like(seen[0], (10 * z / 90) ** 2), rtol=1e-4, atol=0)
+    _, density = patches(thin_intrinsics(K, 10), 9, 12, 3)
+    torch.testing.assert_close(density, torch.full_like(density, 9.0**2))
+    depth, amplitude = corner(90)
+    maps = surface(depth, torch.ones_like(depth), amplitude, K)
+    coarse, fine = (exchange_error(maps, K, HZ, step=s)[..., 40:50, 45:75].mean() for s in (15, 10))
+    assert coarse == pytest.approx(fine.item(), rel=0.15)
 
 
 def test_dark_scenes_have_no_bounce():

@@ -25,7 +25,7 @@ from tofcapture.files.cache import pack
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Losses, Stage, preset, presets
 from tofcapture_model.data import make_target
-from tofcapture_model.evaluation.measures import Precision, Uncertainty, regions
+from tofcapture_model.evaluation.metrics import Precision, Uncertainty, regions
 from tofcapture_model.evaluation.suite import averaged, read_weights
 from tofcapture_model.evaluation.tables import SUITES, cells
 from tofcapture_model.geometry.maps import rays, scale_intrinsics

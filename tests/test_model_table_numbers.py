@@ -14,8 +14,14 @@ from torch.nn import functional as F  # noqa: N812
 from tests.test_model_metrics import DEPTH, GT, MASK, score
 from tests.test_model_networks import frame
 from tofcapture_model.config import Losses
-from tofcapture_model.evaluation.measures import DARK, STRONG_MPI, Uncertainty, regions
-from tofcapture_model.evaluation.metrics import ANGLE_TERMS, DEPTH_TERMS
+from tofcapture_model.evaluation.metrics import (
+    ANGLE_TERMS,
+    DARK,
+    DEPTH_TERMS,
+    STRONG_MPI,
+    Uncertainty,
+    regions,
+)
 from tofcapture_model.evaluation.suite import _free, _learned
 from tofcapture_model.evaluation.tables import SUITES, cells
 from tofcapture_model.frame import Target

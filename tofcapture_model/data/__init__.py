@@ -136,6 +136,22 @@ def crop(frame: Frame, target: Target, top: int, left: int, size: tuple[int, int
     return cut, Target(*(x[..., rows2, cols2] for x in target))
 
 
+def crop_about_object(
+    frame: Frame, target: Target, size: Sequence[int], rng: np.random.Generator
+) -> tuple[Frame, Target]:
+    """Crop about a pixel of good ground truth, because most of an image is background."""
+    h, w = frame.depth.shape[-2:]
+    height, width = min(size[0], h), min(size[1], w)
+    good = target.good[0, ::8, ::8].nonzero()
+    at = np.array([rng.integers(h), rng.integers(w)])
+    if len(good):
+        at = good[int(rng.integers(len(good)))].numpy() * 4 + rng.integers(-16, 17, 2)
+    top, left = (
+        int(np.clip(a - s // 2, 0, n - s)) for a, s, n in zip(at, (height, width), (h, w), strict=True)
+    )
+    return crop(frame, target, top, left, (height, width))
+
+
 def mirror(frame: Frame, target: Target, axis: int = -1) -> tuple[Frame, Target]:
     """Flip left and right (axis -1) or up and down (axis -2): images, camera, and that component of the normals."""
     maps = {k: v.flip(axis) for k, v in frame._asdict().items() if k not in NO_MAPS}
@@ -251,7 +267,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         frame, target = self.frame(sample), self.target(sample)
         rng = np.random.default_rng([self.seed, epoch, i])
         if self.size:
-            frame, target = self._cropped(frame, target, rng)
+            frame, target = crop_about_object(frame, target, self.size, rng)
         if self.flip and rng.random() < 0.5:
             frame, target = mirror(frame, target)
         return frame, target
@@ -296,17 +312,6 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
             return False
         self._room -= size
         return True
-
-    def _cropped(self, frame: Frame, target: Target, rng: np.random.Generator) -> tuple[Frame, Target]:
-        """Crop about a pixel of good ground truth, because most of an image is background."""
-        h, w = frame.depth.shape[-2:]
-        size = (min(self.size[0], h), min(self.size[1], w))
-        good = target.good[0, ::8, ::8].nonzero()
-        at = np.array([rng.integers(h), rng.integers(w)])
-        if len(good):
-            at = good[int(rng.integers(len(good)))].numpy() * 4 + rng.integers(-16, 17, 2)
-        top, left = (int(np.clip(a - s // 2, 0, n - s)) for a, s, n in zip(at, size, (h, w), strict=True))
-        return crop(frame, target, top, left, size)
 
 
 def _expect_alike(readers: Mapping[str, Reader], size: tuple[int, ...]) -> None:

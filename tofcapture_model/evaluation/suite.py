@@ -25,8 +25,7 @@ from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Losses
 from tofcapture_model.data import FrameDataset, batched, spare_memory
 from tofcapture_model.evaluation.evaluate import expect_writable, not_new_of, take_scenes, write_results
-from tofcapture_model.evaluation.measures import Precision, Uncertainty, regions
-from tofcapture_model.evaluation.metrics import Score
+from tofcapture_model.evaluation.metrics import Precision, Score, Uncertainty, regions
 from tofcapture_model.evaluation.tables import SUITES, write_tables
 from tofcapture_model.frame import Frame, Target, frame_to, target_to
 from tofcapture_model.networks import Model
@@ -76,15 +75,11 @@ class Measured:
         return {**whole, "regions": named, "extra": extra}
 
 
-class Kept:
-    """Rows of measured runs in a file, for the next call under the same conditions: the same frames, code and device.
+class RunFile:
+    """Rows of measured runs in a file, for the next call under the same conditions.
 
-    Parameters
-    ----------
-    path
-        JSON; what it holds of other conditions is dropped by the first row that is added. ``None`` keeps nothing.
-    conditions
-        All that a row depends on but its network.
+    ``path`` is JSON; what it holds of other conditions is dropped by the first row that is added, ``None`` keeps nothing. ``conditions``
+    is all that a row depends on but its network.
     """
 
     def __init__(self, path: Path | None, conditions: Mapping[str, Any]) -> None:
@@ -141,9 +136,7 @@ def read_weights(pairs: Sequence[str]) -> dict[str, list[Path]]:
 
 def _free(name: str) -> Callable[[Frame], Answer]:
     def answer(frame: Frame) -> Answer:
-        depth, normals, measured = FREE[name](frame)
-        amplitude = torch.nn.functional.interpolate(frame.confidence, scale_factor=2, mode="nearest")
-        return Answer(depth, normals, measured, -amplitude, scaled=False)
+        return Answer(*FREE[name](frame), -_amplitude(frame), scaled=False)
 
     return answer
 
@@ -154,13 +147,15 @@ def _learned(model: Model, losses: Losses) -> Callable[[Frame], Answer]:
 
     def answer(frame: Frame) -> Answer:
         found = model(frame)
-        amplitude = torch.nn.functional.interpolate(frame.confidence, scale_factor=2, mode="nearest")
-        everywhere = torch.isfinite(found.depth)
-        return Answer(
-            found.depth, found.normals, everywhere, found.error if own else -amplitude, scaled=sigma
-        )
+        expected = found.error if own else -_amplitude(frame)
+        return Answer(found.depth, found.normals, torch.isfinite(found.depth), expected, scaled=sigma)
 
     return answer
+
+
+def _amplitude(frame: Frame) -> Tensor:
+    """Amplitude (B, 1, 2H, 2W): what orders the errors of a method that predicts none."""
+    return torch.nn.functional.interpolate(frame.confidence, scale_factor=2, mode="nearest")
 
 
 @torch.no_grad()
@@ -217,20 +212,10 @@ def run_suite(
     device: str = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Measure methods and write ``results.json`` and the suite's tables beside it; called again, it takes the runs that are measured.
+    """Measure methods and write ``results.json`` and the suite's tables; called again, it takes the runs that are measured.
 
-    Parameters
-    ----------
-    dataset, weights, split, frames, scenes, device, progress
-        As of :func:`measure_runs`.
-    suite
-        One of ``SUITES``, or ``all``.
-    out
-        ``results.json``.
-
-    Returns
-    -------
-    What was written; lengths in metres.
+    ``suite`` is one of ``SUITES`` or ``all``, ``out`` is ``results.json``, all else is as of :func:`measure_runs`. Returns what was
+    written; lengths in metres.
     """
     out = Path(out)
     expect_writable(out)
@@ -275,7 +260,7 @@ def measure_runs(
     device
         Torch device.
     kept
-        File that holds every run as soon as it is measured, and gives it back to the next call (:class:`Kept`); ``None``: none.
+        File that holds every run as soon as it is measured, and gives it back to the next call (:class:`RunFile`); ``None``: none.
     progress
         Called with (done, all).
 
@@ -290,13 +275,13 @@ def measure_runs(
     FormatError
         Weights that are not there.
     """
-    place = torch.device(device)
+    target_device = torch.device(device)
     runs = [(name, i, find_model(path)) for name, paths in weights.items() for i, path in enumerate(paths)]
     data = FrameDataset(dataset, split, frames=frames, cache_bytes=spare_memory())  # every run asks again
     measured = take_scenes(data, split, scenes)
     count = len(data.samples)
-    _expect_fit([(name, path) for name, _, path in runs], data, place)
-    known = Kept(kept, _conditions(dataset, split, frames, scenes, device))
+    _expect_fit([(name, path) for name, _, path in runs], data, target_device)
+    known = RunFile(kept, _conditions(dataset, split, frames, scenes, device))
 
     def part(nth: int) -> Callable[[int, int], None]:
         return lambda done, _all: progress(nth * count + done, (len(runs) + 1) * count) if progress else None
@@ -307,7 +292,7 @@ def measure_runs(
             print(f"{', '.join(keys)}: measured before, taken from {where}", file=sys.stderr, flush=True)
             part(nth)(count, count)
         else:
-            found = measure(data, methods, place, part(nth))
+            found = measure(data, methods, target_device, part(nth))
             known.add({keys[name]: row for name, row in found.items()})
         return {name: known.rows[key] for name, key in keys.items()}
 
@@ -324,7 +309,7 @@ def measure_runs(
             "training": origin(provenance),
             "not_new": not_new_of(provenance, dataset, split, measured),
         }
-        row = rows(nth, {name: digest}, {name: _learned(model.to(place), config.losses)})[name]
+        row = rows(nth, {name: digest}, {name: _learned(model.to(target_device), config.losses)})[name]
         by_name.setdefault(name, []).append({**row, "budget": budget(provenance)})
     data.close()
     table |= {name: averaged(found) for name, found in by_name.items()}
@@ -344,12 +329,12 @@ def measure_runs(
 
 
 @torch.no_grad()
-def _expect_fit(runs: Sequence[tuple[str, Path]], data: FrameDataset, place: torch.device) -> None:
+def _expect_fit(runs: Sequence[tuple[str, Path]], data: FrameDataset, target_device: torch.device) -> None:
     """Have every network answer one frame, so that what is wrong with it is said before hours of measuring."""
-    frame = frame_to(batched(data.frame(data.samples[0])), place)
+    frame = frame_to(batched(data.frame(data.samples[0])), target_device)
     for name, path in runs:
         try:
-            load_model(path)[0].to(place)(frame)
+            load_model(path)[0].to(target_device)(frame)
         except ConfigError as err:
             raise ConfigError(f"{name}={path}: {err.message}", hint=err.hint) from err
 
@@ -363,23 +348,7 @@ def seen_before(results: Mapping[str, Any]) -> str:
 def write_suite(
     results: Mapping[str, Any], suite: str, out: Path, names: Collection[str] | None = None
 ) -> dict[str, Any]:
-    """Write ``results.json`` and tables.
-
-    Parameters
-    ----------
-    results
-        Of :func:`measure_runs`.
-    suite
-        One of ``SUITES``, or ``all``.
-    out
-        ``results.json``; the tables go beside it.
-    names
-        Methods that take part; ``None``: all.
-
-    Returns
-    -------
-    What was written.
-    """
+    """Write ``results.json`` and, beside it, tables of what :func:`measure_runs` found; of these methods only, ``None``: of all."""
     named = {**results, "suite": suite}
     if names is not None:
         for key in ("methods", "spread", "runs"):

@@ -119,7 +119,7 @@ def exchange_error(
     maps = surfaces[:, :, step // 2 :: step, step // 2 :: step]
     h, w = maps.shape[-2:]
     around = F.pad(maps, (margin, margin, margin, margin), mode="replicate")
-    r, density = _patches(thin_intrinsics(intrinsics, step), h, w, margin)
+    r, density = patches(thin_intrinsics(intrinsics, step), h, w, margin)
     found = torch.stack(
         [
             _exchange(m.flatten(1), q.flatten(1), d.flatten(), hz)
@@ -130,7 +130,7 @@ def exchange_error(
     return F.interpolate(inner, size=size, mode="bilinear", align_corners=False)
 
 
-def _patches(grid: Tensor, height: int, width: int, margin: int) -> tuple[Tensor, Tensor]:
+def patches(grid: Tensor, height: int, width: int, margin: int) -> tuple[Tensor, Tensor]:
     """Return rays (B, 3, H, W) of a grid with ``margin`` more pixels at each border, and pixels per unit of z = 1 (B, H, W).
 
     A lens is known inside its image only, and many fold outside: beyond the border it goes on straight.

@@ -1,4 +1,4 @@
-"""A trained model for other runtimes: ONNX with any batch size, and ``torch.export``; checked against torch before it is kept."""
+"""Export a trained model to ONNX or ``torch.export``, checked against torch before it is kept, and run exports in onnxruntime."""
 
 from __future__ import annotations
 
@@ -7,16 +7,22 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.seal import sha256_of
-from tofcapture_model.config import dumps_config
+from tofcapture_model.config import Config, dumps_config, loads_config
 from tofcapture_model.frame import Estimate, Frame
-from tofcapture_model.inference.onnx_backend import CONFIG, DIGEST, OUTPUTS, ask_onnx, open_onnx
+from tofcapture_model.geometry.maps import LENS, with_lens
 from tofcapture_model.networks.checkpoint import find_model, load_model
 
+OUTPUTS = ("depth_2x", "normals_2x", "error_2x")
+DIGEST, CONFIG = "weights_sha256", "config.toml"
+"""What an export carries beside the network: SHA-256 of the checkpoint's file, and its configuration. Metadata of ``.onnx``, extra files
+of ``.pt2``."""
 SUFFIX = {"onnx": ".onnx", "torch": ".pt2"}
 SIZE = (180, 240)  # px, sensor rows and columns
 OPSET = 17
@@ -67,7 +73,7 @@ def export(
     """Export a model and hold the result against torch on two batch sizes.
 
     The export carries its configuration and the SHA-256 of the checkpoint
-    (:data:`tofcapture_model.inference.onnx_backend.DIGEST`). Nothing but ``out`` is written.
+    (:data:`DIGEST`). Nothing but ``out`` is written.
 
     Parameters
     ----------
@@ -176,3 +182,66 @@ def _differences(flat: nn.Module, path: Path, kind: str, size: tuple[int, int]) 
                 raise DataError(f"the export's {name} differs from torch's by up to {float(apart.max()):.2g}")
             worst[name] = max(worst[name], float(apart.max()))
     return worst
+
+
+def open_onnx(path: Path) -> Any:
+    """Open an exported model."""
+    try:
+        import onnxruntime
+    except ImportError as err:
+        raise ConfigError(f"cannot run ONNX: {err}", hint="pip install tofcapture[onnx]") from err
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def config_of(session: Any, path: Path, weights: Path) -> Config:
+    """Configuration of an opened export, once it is certain that the export is one of these weights.
+
+    Parameters
+    ----------
+    session
+        What :func:`open_onnx` opened.
+    path
+        The export, for messages.
+    weights
+        The checkpoint beside it; where there is none, the export stands for itself.
+
+    Raises
+    ------
+    ConfigError
+        The export is of other weights, or too old to tell.
+    """
+    told = session.get_modelmeta().custom_metadata_map
+    again = f"run tofcapture export again: tofcapture export --weights {weights} --out {path}"
+    if DIGEST not in told or CONFIG not in told:
+        raise ConfigError(
+            f"{path}: expected an export that says of which weights it is, got none", hint=again
+        )
+    if weights.exists() and (found := sha256_of(weights)) != told[DIGEST]:
+        raise ConfigError(
+            f"{path}: expected an export of {weights} (sha256 {found[:12]}...), got one of other weights ({told[DIGEST][:12]}...)",
+            hint=again,
+        )
+    return loads_config(told[CONFIG], str(path))
+
+
+def ask_onnx(session: Any, frame: Frame) -> list[NDArray[np.float32]]:
+    """Run an opened model on a frame; inputs that the export found unused are not asked for.
+
+    Raises
+    ------
+    ConfigError
+        The camera has a lens, and the export was made before they took one.
+    """
+    wanted = {i.name: i.shape for i in session.get_inputs()}
+    numbers = wanted.get("intrinsics", (0, LENS))[1]
+    if frame.intrinsics.shape[1] > numbers:
+        raise ConfigError(
+            "expected an export for cameras with lens distortion, got one that takes none",
+            hint="run tofcapture export again: it takes any lens now",
+        )
+    asked = frame._replace(intrinsics=with_lens(frame.intrinsics)[:, :numbers])
+    feed = {k: np.ascontiguousarray(v.numpy()) for k, v in asked._asdict().items() if k in wanted}
+    found: list[NDArray[np.float32]] = session.run(list(OUTPUTS), feed)
+    return found

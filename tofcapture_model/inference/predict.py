@@ -39,8 +39,8 @@ class _Watch(Protocol):
     def __call__(self, work: Callable[[], T], wait: Callable[[], None], /) -> tuple[T, float]: ...
 
 
-class _Way(NamedTuple):
-    """How one camera's frames are answered: taps and temperature to inputs on the device, these to depth, normals, error and what was measured."""
+class _Prepared(NamedTuple):
+    """What is ready for a camera: from taps and temperature to inputs on the device, from these to depth, normals, error, validity."""
 
     prepare: Callable[[NDArray[Any], float], Any]
     ask: Callable[[Any], tuple[Tensor, ...]]
@@ -49,16 +49,9 @@ class _Way(NamedTuple):
 class Predictor:
     """A network that answers frame after frame: loaded once, and on a GPU recorded once per camera.
 
-    Call it with
-
-    - ``raw``: (K, H, W) taps of one frame, any real dtype, or a mean that :func:`tofcapture_model.data.raw_input.taken` took;
-    - ``info``: :class:`tofcapture.frames.TofInfo`, channels, saturation, light source, range errors. What is prepared for a camera is
-      kept for the last four: decoding tables, which take as long as some frames, and on a GPU the recording;
-    - ``camera``: calibrated intrinsics, ``None``: those of ``info``;
-    - ``celsius``: sensor temperature, NaN: unknown.
-
-    It returns a :class:`Prediction` without times: depth, expected error (m), normals and what was measured, at (2H, 2W), in arrays of
-    its own.
+    Call it with ``raw``, (K, H, W) taps of one frame or a mean that :func:`tofcapture_model.data.raw_input.taken` took; ``info``, the
+    channels, saturation, light source and range errors; ``camera``, intrinsics (``None``: those of ``info``); ``celsius``, NaN: unknown.
+    It answers with a :class:`Prediction` without times, in arrays of its own. Tables and recordings of the last four cameras are kept.
 
     Parameters
     ----------
@@ -72,18 +65,17 @@ class Predictor:
     Raises
     ------
     ConfigError
-        No such weights or export, an export of other weights; when called: a camera of another size than the export's, or with a lens that
-        the export does not know.
+        No such weights or export, or one of other weights; when called: a size or lens that the export does not know.
     DataError
         When called: taps that are not finite, or of a frame in which no pixel measured anything.
     """
 
     def __init__(self, weights: Path | None = None, device: str = "cpu", backend: str = "torch") -> None:
         self._ask, self.network = _onnx_model(weights) if backend == "onnx" else torch_model(weights, device)
-        self._place = torch.device("cpu" if backend == "onnx" else device)
-        self._ways: dict[Hashable, _Way] = {}
+        self._device = torch.device("cpu" if backend == "onnx" else device)
+        self._prepared: dict[Hashable, _Prepared] = {}
         if self._on_gpu:
-            torch.cuda.set_device(self._place)  # streams, graphs and waiting are the current one's
+            torch.cuda.set_device(self._device)  # streams, graphs and waiting are the current one's
 
     def __call__(
         self, raw: NDArray[Any], info: TofInfo, camera: Camera | None = None, celsius: float = math.nan
@@ -93,7 +85,7 @@ class Predictor:
 
     @property
     def _on_gpu(self) -> bool:
-        return self._place.type == "cuda"
+        return self._device.type == "cuda"
 
     def _answer(
         self, raw: NDArray[Any], info: TofInfo, camera: Camera, celsius: float, where: str, watch: _Watch
@@ -101,9 +93,9 @@ class Predictor:
         expect_finite(raw, where)
         wait: Callable[[], None] = torch.cuda.synchronize if self._on_gpu else lambda: None
         with torch.inference_mode():
-            way = self._way(info, camera)
-            inputs, decode_ms = watch(lambda: way.prepare(raw, celsius), wait)
-            (depth, normals, error, valid), inference_ms = watch(lambda: way.ask(inputs), wait)
+            prepared = self._prepare(info, camera)
+            inputs, decode_ms = watch(lambda: prepared.prepare(raw, celsius), wait)
+            (depth, normals, error, valid), inference_ms = watch(lambda: prepared.ask(inputs), wait)
         measured = _image(valid)[0] > 0
         if not measured.any():
             raise _nothing(raw, info, where)
@@ -118,38 +110,38 @@ class Predictor:
             decode_ms=decode_ms,
         )
 
-    def _way(self, info: TofInfo, camera: Camera) -> _Way:
+    def _prepare(self, info: TofInfo, camera: Camera) -> _Prepared:
         key = (
             camera, tuple(info.modulation_hz), tuple(info.phase_rad), tuple(map(float, info.illuminator)),
             info.saturation, tuple(info.range_errors),
         )  # fmt: skip
-        way = self._ways.pop(key, None)
-        if way is None:
-            if len(self._ways) == CAMERAS:  # before another one is made: a graph holds memory of its own
-                self._ways.pop(next(iter(self._ways)))
-            way = (self._on_the_device if self._on_gpu else self._on_the_host)(info, camera)
-        self._ways[key] = way  # the last one used stands last
-        return way
+        prepared = self._prepared.pop(key, None)
+        if prepared is None:
+            if len(self._prepared) == CAMERAS:  # before another one is made: a graph holds memory of its own
+                self._prepared.pop(next(iter(self._prepared)))
+            prepared = (self._on_the_device if self._on_gpu else self._on_the_host)(info, camera)
+        self._prepared[key] = prepared  # the last one used stands last
+        return prepared
 
-    def _on_the_host(self, info: TofInfo, camera: Camera) -> _Way:
+    def _on_the_host(self, info: TofInfo, camera: Camera) -> _Prepared:
         """Decode by the tables of numpy; what is asked is a frame."""
         decoder = frame_decoder(info, camera)
 
         def ask(frame: Frame) -> tuple[Tensor, ...]:
             return *self._ask(frame), frame.valid
 
-        return _Way(lambda raw, celsius: batched(make_frame(raw, info, camera, celsius, decoder)), ask)
+        return _Prepared(lambda raw, celsius: batched(make_frame(raw, info, camera, celsius, decoder)), ask)
 
-    def _on_the_device(self, info: TofInfo, camera: Camera) -> _Way:
+    def _on_the_device(self, info: TofInfo, camera: Camera) -> _Prepared:
         """Copy the taps, and launch all the rest at once."""
-        decoder, high = TorchDecoder(info, camera, self._place), frequencies(info.modulation_hz)[1]
+        decoder, high = TorchDecoder(info, camera, self._device), frequencies(info.modulation_hz)[1]
 
         def ask(taps: Taps) -> tuple[Tensor, ...]:
             frame = with_cues(decoder(taps), high)
             return *self._ask(frame), frame.valid
 
         dark = np.zeros((len(info.modulation_hz), *camera.shape), np.float32)
-        return _Way(decoder.taps, recorded(ask, decoder.taps(dark, math.nan)))
+        return _Prepared(decoder.taps, recorded(ask, decoder.taps(dark, math.nan)))
 
 
 def _image(tensor: Tensor) -> Float32:
@@ -176,24 +168,9 @@ def predict_raw(
     *,
     timed: bool = False,
 ) -> Prediction:
-    """Run a model on one frame of a burst, or with ``frame = None`` on the burst's mean (:func:`tofcapture_model.data.raw_input.taken`).
+    """Run a model on one frame of a burst, or with ``frame = None`` on its mean; arguments as of :class:`Predictor`.
 
-    For more than one frame, :class:`Predictor` loads the model once.
-
-    Parameters
-    ----------
-    data
-        The burst.
-    frame
-        Number of the frame.
-    weights
-        Checkpoint; ``None``: the bundled one.
-    device
-        Torch device.
-    backend
-        ``torch``, or ``onnx`` for the ``model.onnx`` that lies beside the checkpoint.
-    timed
-        Decode and ask ten times, and tell how long it takes.
+    ``timed`` decodes and asks ten times, and tells how long it takes.
     """
     raw, celsius = taken(data.raw, frame, data.info.saturation, data.celsius)
     predictor = Predictor(weights, device, backend)
@@ -224,9 +201,7 @@ Inputs = TypeVar("Inputs", Frame, Taps)
 def recorded(
     ask: Callable[[Inputs], tuple[Tensor, ...]], like: Inputs
 ) -> Callable[[Inputs], tuple[Tensor, ...]]:
-    """Record what a GPU does for a frame as a CUDA graph, so that every further one takes a single launch.
-
-    A prediction is about a thousand small kernels; launching them one by one takes longer than running them.
+    """Record what a GPU does for a frame as a CUDA graph: a thousand small kernels then take a single launch.
 
     Parameters
     ----------
@@ -237,7 +212,8 @@ def recorded(
 
     Returns
     -------
-    The same question; an answer lasts until the next one.
+    function
+        The same question; an answer lasts until the next one.
     """
     held = type(like)(*(x.clone() for x in like))
     beside = torch.cuda.Stream(like.raw.device)  # type: ignore[no-untyped-call]
@@ -251,8 +227,8 @@ def recorded(
         answer = ask(held)
 
     def replay(inputs: Inputs) -> tuple[Tensor, ...]:
-        for place, new in zip(held, inputs, strict=True):
-            place.copy_(new)
+        for buffer, new in zip(held, inputs, strict=True):
+            buffer.copy_(new)
         graph.replay()
         return answer
 
@@ -295,7 +271,7 @@ def has_bfloat16(kind: str) -> bool:
 
 
 def _onnx_model(weights: Path | None) -> tuple[Ask, str]:
-    from tofcapture_model.inference.onnx_backend import ask_onnx, config_of, open_onnx
+    from tofcapture_model.inference.export import ask_onnx, config_of, open_onnx
 
     named = find_model(weights)  # a checkpoint, or the export itself
     path = named.with_suffix(".onnx")

@@ -26,9 +26,7 @@ from tofcapture.meshes import (
 from tofcapture.poses import Float64, rotation_exp, transform
 
 BOARD_SIZE = (0.5, 0.4, 0.010)  # m
-_UPRIGHT = transform(
-    rotation_exp([np.pi / 2, 0, 0]), [0, 0, 0]
-)  # turns extrusion from z to -y: an outline's y points up
+_UPRIGHT = transform(rotation_exp([np.pi / 2, 0, 0]), [0, 0, 0])  # turns an outline's y from along to up
 
 
 def sphere(rng: np.random.Generator) -> Mesh:
@@ -38,19 +36,14 @@ def sphere(rng: np.random.Generator) -> Mesh:
 
 def ball(radius: float, rings: int = 48, segments: int = 72) -> Mesh:
     """Make a sphere of a given radius, metres, on z = 0."""
-    return settle(revolve(_half_circle(radius, rings), segments))
-
-
-def _half_circle(radius: float, steps: int) -> Float64:
-    """Profile of a sphere, from pole to pole."""
-    latitude = np.linspace(-np.pi / 2, np.pi / 2, steps + 1)
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
     profile = radius * np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
     profile[[0, -1], 0] = 0.0
-    return profile
+    return settle(revolve(profile, segments))
 
 
 def _smooth(heights: Float64, radii: Float64, steps: int) -> Float64:
-    """(steps, 2) profile through control radii, cubic Hermite with Catmull-Rom slopes."""
+    """Draw a profile (steps, 2) through control radii, cubic Hermite with Catmull-Rom slopes."""
     slopes = np.gradient(radii, heights)
     z = np.linspace(heights[0], heights[-1], steps)
     k = np.clip(np.searchsorted(heights, z, side="right") - 1, 0, len(heights) - 2)
@@ -245,7 +238,7 @@ def tool(rng: np.random.Generator) -> Mesh:
 
 
 def _arc(start: float, stop: float) -> Float64:
-    """(33, 2) points of a unit circle from one angle to another, radians."""
+    """Draw points (33, 2) of a unit circle from one angle to another, radians."""
     angle = np.linspace(start, stop, 33)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
