@@ -1,4 +1,4 @@
-"""Make the pictures of these pages anew: ``python docs/screenshots.py demo-out``, after ``make demo`` and ``make docs``.
+"""Make the pictures of these pages anew: ``python docs/screenshots.py demo-out``, after ``make demo``.
 
 Needs playwright and Debian's chromium. The daemon's page is photographed by its own test (``TOFCAPTURE_SCREENSHOTS=1 pytest -m slow
 tests/test_daemon_browser.py``).
@@ -13,14 +13,13 @@ import threading
 from pathlib import Path
 
 PICTURES = Path(__file__).parent / "pictures"
-SITE = Path(__file__).parent.parent / "build" / "docs" / "index.html"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 SHEETS = {"dataset": "view-sheet", "recording": "view-recording", "recording/rig.toml": "view-calibration"}
 RERUN_SECONDS = 30  # until a software renderer has drawn the space
 
 
 def pictures(demo: Path) -> None:
-    """Draw the contact sheets, and photograph Rerun, the report and the site's home."""
+    """Draw the contact sheets, and photograph Rerun and the report."""
     from playwright.sync_api import sync_playwright
 
     from tofcapture.cli import main
@@ -39,10 +38,9 @@ def pictures(demo: Path) -> None:
             page.wait_for_timeout(1000 * RERUN_SECONDS)
             page.screenshot(path=PICTURES / "view-rerun.png")
             server.shutdown()
-        for path, name in ((demo / "report.html", "report"), (SITE, "docs-home")):
-            page.goto(path.resolve().as_uri())
-            page.wait_for_timeout(1000)
-            page.screenshot(path=PICTURES / f"{name}.png")
+        page.goto((demo / "report.html").resolve().as_uri())
+        page.wait_for_timeout(1000)
+        page.screenshot(path=PICTURES / "report.png")
         browser.close()
 
 
