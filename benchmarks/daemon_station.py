@@ -5,7 +5,8 @@
 The worker's environment: ``BENCH_DELAY`` seconds per device step, ``BENCH_LOG`` a file that gets a line per move and stop of the arm,
 ``BENCH_FULL`` a file: while it exists, the disk is full from the write on whose number stands in it;
 ``BENCH_ASKS`` set: a person must confirm the scene; ``BENCH_HOST`` set: the arm has a driver host; ``BENCH_LARGE`` set: images of full size;
-``BENCH_REAL`` set: the arm is a real one. The daemon's: ``BENCH_LOST`` seconds of silence after which a recorder is killed,
+``BENCH_REAL`` set: the arm is a real one; ``BENCH_HOLD`` a file: while it exists, the device step whose number stands in it waits, until
+the arm is stopped. The daemon's: ``BENCH_LOST`` seconds of silence after which a recorder is killed,
 ``BENCH_IDLE`` seconds that a connection may take.
 """
 
@@ -73,12 +74,22 @@ class _Arrays:
         from tofcapture.devices.kinematics import HOME
 
         self.np, self.joints, self.role = np, HOME.copy(), ""
+        self.steps, self.stopped = 0, False
         a, b = (10, 40) if "BENCH_LARGE" in os.environ else (1, 1)
         self.tof = Camera(24, 18, 20.0, 20.0, 11.5, 8.5).scaled(a)
         self.stereo = Camera(32, 24, 30.0, 30.0, 15.5, 11.5).scaled(b)
 
     def step(self) -> None:
         time.sleep(float(os.environ.get("BENCH_DELAY", "0")))
+        self.steps += 1
+        while self._held() and not self.stopped:
+            time.sleep(0.01)
+
+    def _held(self) -> bool:
+        try:
+            return self.steps >= int(Path(os.environ["BENCH_HOLD"]).read_text(encoding="ascii"))
+        except (KeyError, OSError):
+            return False
 
     def rng(self, name: str) -> Any:
         return self.np.random.default_rng(
@@ -116,6 +127,7 @@ class _Role:
         return self.state()
 
     def stop(self) -> None:
+        self.bench.stopped = True
         self._note("stop")
 
     def _note(self, word: str) -> None:

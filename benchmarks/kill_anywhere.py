@@ -67,7 +67,7 @@ class Rig:
         """End the daemon politely."""
         if self.process is not None:
             self.process.terminate()
-            self.process.wait(10)
+            self.process.wait(60)
 
     def ask(self, method: str, path: str, body: dict[str, Any] | None = None) -> dict[str, Any] | None:
         """Ask; ``None`` when the daemon is dying."""

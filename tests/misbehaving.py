@@ -62,7 +62,7 @@ class Camera17(TofCamera):
     Parameters
     ----------
     table
-        ``open`` and ``capture``: what :func:`misbehave` does there; ``once``: a file that is made the first time, after which
+        ``open`` and ``expose``: what :func:`misbehave` does there; ``once``: a file that is made the first time, after which
         the camera behaves.
     context
         Not needed.
@@ -86,7 +86,7 @@ class Camera17(TofCamera):
         if once is None or not once.exists():
             if once is not None:
                 once.touch()
-            misbehave(self._table.get("capture", ""))
+            misbehave(self._table.get("expose", ""))
         raw = np.random.default_rng(frames).integers(0, 4096, (frames, 8, 90, 120), dtype=np.uint16)
         return TofBurst(raw, np.arange(frames), np.full(frames, np.nan), self.describe())
 
@@ -97,7 +97,8 @@ class Arm17(Arm):
     Parameters
     ----------
     table
-        ``move``: what :func:`misbehave` does in ``move_to``; ``seconds``: how long a move takes.
+        ``move``: what :func:`misbehave` does in ``move_to``; ``seconds``: how long a move takes; ``moving``: a file that
+        is made when it begins.
     context
         Not needed.
     """
@@ -122,6 +123,8 @@ class Arm17(Arm):
         """Take a while."""
         misbehave(self._table.get("move", ""))
         self._stop.clear()
+        if "moving" in self._table:
+            Path(self._table["moving"]).touch()
         if self._stop.wait(float(self._table.get("seconds", 0.0))):
             raise MotionRefused("the motion was stopped on request")
         self._joints = joints

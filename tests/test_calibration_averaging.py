@@ -16,7 +16,7 @@ from calibration.alignment.averages import (
 from tofcapture import poses
 
 seeds = st.integers(0, 2**32 - 1)
-few = settings(max_examples=25, deadline=None)
+few = settings(max_examples=25)
 
 
 def rotations(rng, count, spread=0.3):

@@ -24,7 +24,7 @@ REAL = Path(__file__).resolve().parents[2] / "shared" / "realdata"
 MOVEIT = REAL / "hand_eye_moveit" / "pose_samples.json"
 ETH = REAL / "hand_eye_ethz" / "robot_arm"
 seeds = st.integers(0, 2**32 - 1)
-few = settings(max_examples=10, deadline=None)
+few = settings(max_examples=10)
 
 
 def refused(hand, target, **how):

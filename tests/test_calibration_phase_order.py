@@ -18,7 +18,7 @@ from tofcapture.rig import SPEED_OF_LIGHT
 
 SHAPE = (60, 80)
 seeds = st.integers(0, 2**32 - 1)
-few = settings(max_examples=15, deadline=None)
+few = settings(max_examples=15)
 
 
 def scene(rng):

@@ -40,7 +40,7 @@ def test_project_and_rays_are_opencvs():
 
 
 @given(st.floats(-0.15, 0.2), st.floats(0.0, 0.1), st.floats(-0.003, 0.003), st.floats(-0.003, 0.003))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_rays_of_a_lens_project_to_their_pixels(k1, k2, p1, p2):
     """Undistortion inverts distortion over the whole image for every moderate lens."""
     camera = replace(PLAIN, distortion=(k1, k2, p1, p2, 0.0))

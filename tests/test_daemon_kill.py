@@ -21,7 +21,7 @@ def _torment(*options, seconds):
 
 def test_a_few_blows_on_a_quick_station():
     """Three kills and one full disk in a recording of arrays."""
-    told = _torment("--kills", "3", "--full", "1", "--views", "5", "--station", "arrays", seconds=200)
+    told = _torment("--kills", "3", "--full", "1", "--views", "5", "--station", "arrays", seconds=290)
     assert told["ok"]
     assert sum(told["blows"].values()) == 4
 

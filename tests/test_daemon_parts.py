@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests import PATIENCE
 from tests.test_daemon_api import STATION
 from tofcapture.cli import main
 from tofcapture.colours import GREY
@@ -129,7 +130,7 @@ def test_systemd_hears_of_it(tmp_path):
     pytest.importorskip("aiohttp")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
         link.bind(str(tmp_path / "n"))
-        link.settimeout(20)
+        link.settimeout(PATIENCE)
         env = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "n"), "WATCHDOG_USEC": "400000"}
         command = [sys.executable, STATION, "daemon", tmp_path / "root", tmp_path / "st"]
         process = subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL)
@@ -139,7 +140,7 @@ def test_systemd_hears_of_it(tmp_path):
         process.send_signal(signal.SIGTERM)
         while not any("STOPPING=1" in line for line in heard):
             heard.append(link.recv(500).decode())
-        assert process.wait(10) == 0
+        assert process.wait(PATIENCE) == 0
     assert any("READY=1" in line for line in heard)
     assert any("STATUS=idle" in line for line in heard)
 

@@ -16,7 +16,7 @@ NAMES = st.lists(
 
 
 @given(NAMES)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_no_object_is_in_two_splits_and_both_ends_exist(names):
     """Scenes of one object share a split; with two objects or more there is something to train and to test on."""
     splits = assign_splits(names)
@@ -29,7 +29,7 @@ def test_no_object_is_in_two_splits_and_both_ends_exist(names):
 
 
 @given(NAMES, NAMES)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_adding_scenes_moves_nobody(names, more):
     """From ten objects on, a scene stays where it is whatever is added, unless the test set was empty."""
     base = [f"{n}{i}x" for i in range(30) for n in ("aa", "bb")] + names
@@ -63,7 +63,7 @@ SETS = st.dictionaries(
 
 
 @given(SETS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_scenes_that_share_an_object_share_a_split(sets):
     """No object that a scene is known to show is in two splits, whatever chains of scenes tie objects together."""
     splits = assign_splits(sets, sets)

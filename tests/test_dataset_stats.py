@@ -47,7 +47,7 @@ def test_the_numbers_are_those_of_the_arrays(dataset):
     json.dumps(stats.table(), allow_nan=False)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.floats(-50, 200, width=32), min_size=1, max_size=60), st.floats(0, 1))
 def test_quantiles_are_right_to_a_bin(values, q):
     """In parts or at once, with values beyond the range: off by a bin at most where the range holds them."""

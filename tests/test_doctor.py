@@ -8,6 +8,7 @@ from importlib.metadata import requires
 
 import pytest
 
+from tests import PATIENCE
 from tofcapture.cli import doctor, main, probe
 from tofcapture.cli.probe import Finding
 
@@ -104,7 +105,7 @@ def test_a_library_that_hangs_or_crashes(monkeypatch, tmp_path, code, words):
     script.write_text(f"#!{sys.executable}\n{code}\n")
     script.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(script))
-    (finding,) = probe.probe("open3d", timeout=2.0 if "sleep" in code else 30.0)
+    (finding,) = probe.probe("open3d", timeout=2.0 if "sleep" in code else PATIENCE)
     assert finding.verdict == "FAIL"
     assert words in finding.found
     assert finding.advice

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests import misbehaving
+from tests import PATIENCE, alive, misbehaving, until
 from tofcapture.devices.faults import HostLost, ProtectiveStop
 from tofcapture.devices.host import hosted, process
 from tofcapture.devices.registry import StationContext
@@ -22,24 +22,9 @@ CONTEXT = StationContext({}, Path())
 CAMERA, ARM = "tests.misbehaving:Camera17", "tests.misbehaving:Arm17"
 
 
-def _camera(deadline=20.0, **table):
-    return hosted("tof", CAMERA, {"capture": deadline, "__enter__": deadline})(table, CONTEXT)
-
-
-def _alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    # A child that its parent has not waited for is dead all the same.
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-
-
-def _gone(pid, seconds):
-    end = time.monotonic() + seconds
-    while _alive(pid) and time.monotonic() < end:
-        time.sleep(0.05)
-    return not _alive(pid)
+def _camera(opening=PATIENCE, capture=PATIENCE, **table):
+    """A camera in a process of its own, with the seconds that its calls may take."""
+    return hosted("tof", CAMERA, {"capture": capture, "__enter__": opening})(table, CONTEXT)
 
 
 def test_bursts_come_through_whole():
@@ -55,35 +40,35 @@ def test_bursts_come_through_whole():
         assert burst.raw.dtype == np.uint16
         burst.raw[0] = 0
         np.testing.assert_array_equal(camera.capture(3).raw, expected.raw)
-    assert not _alive(pid)
+    assert not alive(pid)
     with pytest.raises(DeviceError, match="not open"):
         camera.capture(1)
 
 
 @pytest.mark.parametrize(
-    ("how", "pattern"),
+    ("how", "seconds", "pattern"),
     [
-        ("hang", "took more than 1 s"),
-        ("crash", "exit status -11"),
-        ("print", "status 4; it last said: vendor says hello"),
+        ("hang", 3.0, "took more than 3 s"),
+        ("crash", PATIENCE, "exit status -11"),
+        ("print", PATIENCE, "status 4; it last said: vendor says hello"),
     ],
 )
-def test_a_lost_camera_is_named_and_replaced(tmp_path, how, pattern):
+def test_a_lost_camera_is_named_and_replaced(tmp_path, how, seconds, pattern):
     """A child that hangs, crashes or ends is a named error with its last words; the next call has a new child."""
-    with _camera(1.0, capture=how, once=str(tmp_path / "once")) as camera:
+    with _camera(PATIENCE, seconds, expose=how, once=str(tmp_path / "once")) as camera:
         first = camera.pid
         with pytest.raises(HostLost, match=pattern):
             camera.capture(1)
         assert camera.capture(1).raw.shape[0] == 1
         assert camera.pid != first
-        assert not _alive(first)
+        assert not alive(first)
 
 
 def test_a_library_that_holds_the_lock_is_noticed(monkeypatch):
     """Silence ends a call long before its deadline when the library keeps Python from running."""
-    monkeypatch.setattr(process, "SILENCE", 1.0)
+    monkeypatch.setattr(process, "SILENCE", 3.0)
     with (
-        _camera(60.0, capture="hang holding the lock") as camera,
+        _camera(expose="hang holding the lock") as camera,
         pytest.raises(HostLost, match="fell silent"),
     ):
         camera.capture(1)
@@ -91,8 +76,8 @@ def test_a_library_that_holds_the_lock_is_noticed(monkeypatch):
 
 def test_a_slow_driver_that_lives_is_waited_for(monkeypatch):
     """A long call is no silence as long as the driver's process can say that it lives."""
-    monkeypatch.setattr(process, "SILENCE", 1.0)
-    with hosted("arm", ARM)({"seconds": 2.5}, CONTEXT) as arm:
+    monkeypatch.setattr(process, "SILENCE", 3.0)
+    with hosted("arm", ARM)({"seconds": 4.5}, CONTEXT) as arm:
         assert arm.move_to(np.ones(6)).joints.tolist() == [1.0] * 6
 
 
@@ -105,26 +90,30 @@ def test_opening_has_a_deadline():
 
 def test_vendor_errors_are_named_and_ours_pass_as_they_are():
     """Another library's exception becomes a DeviceError with its name; ours keep message and hint. The child lives on."""
-    with _camera(capture="raise") as camera:
+    with _camera(expose="raise") as camera:
         pid = camera.pid
         with pytest.raises(DeviceError, match="LookupError: VENDOR_STATUS_17"):
             camera.capture(1)
         assert camera.pid == pid
-    with _camera(capture="refuse") as camera, pytest.raises(DeviceError, match="lens cap") as caught:
+    with _camera(expose="refuse") as camera, pytest.raises(DeviceError, match="lens cap") as caught:
         camera.capture(1)
     assert caught.value.hint == "take it off"
 
 
-def test_stop_reaches_a_move():
-    """Another thread's stop ends a running move at once."""
-    with hosted("arm", ARM)({"seconds": 30.0}, CONTEXT) as arm:
-        timer = threading.Timer(0.3, arm.stop)
-        timer.start()
-        start = time.monotonic()
+def test_stop_reaches_a_move(tmp_path):
+    """Another thread's stop ends a running move."""
+    moving = tmp_path / "moving"
+
+    def stop():
+        until(moving.exists)
+        arm.stop()
+
+    with hosted("arm", ARM)({"seconds": 1000.0, "moving": str(moving)}, CONTEXT) as arm:
+        thread = threading.Thread(target=stop)
+        thread.start()
         with pytest.raises(MotionRefused, match="on request"):
             arm.move_to(np.ones(6))
-        assert time.monotonic() - start < 10
-        timer.join()
+        thread.join()
         assert arm.state().joints.tolist() == [0.0] * 6
 
 
@@ -192,23 +181,20 @@ def _orphan(verb, how, deadline):
 
 
 def _child_of(pid):
-    end = time.monotonic() + 20
-    while time.monotonic() < end:
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-        if children:
-            time.sleep(2.0)
-            return children[0]
-        time.sleep(0.05)
-    raise AssertionError("no child")
+    children = until(Path(f"/proc/{pid}/task/{pid}/children").read_text)
+    time.sleep(2.0)  # it begins to open, though it cannot say so
+    return children.split()[0]
 
 
 @pytest.mark.parametrize("how", ["hang", pytest.param("", marks=pytest.mark.slow)])
 def test_no_orphans(how):
     """SIGKILL of the station's process ends the driver's process, idle or in a call."""
-    assert _gone(_orphan("capture", how, 5.0), 5)
+    child = _orphan("expose", how, PATIENCE)
+    until(lambda: not alive(child))
 
 
 @pytest.mark.slow
 def test_no_orphans_when_the_library_holds_the_lock():
     """Even a child that cannot run Python ends: a timer in C ends it."""
-    assert _gone(_orphan("open", "hang holding the lock", 6.0), 15)
+    child = _orphan("open", "hang holding the lock", 6.0)
+    until(lambda: not alive(child))

@@ -75,7 +75,7 @@ def same(a, b):
 
 
 @given(st.integers(0, 2**31), st.booleans(), st.booleans(), st.integers(1, 3))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_round_trip_is_bit_exact(tmp_path_factory, seed, ideal, truth, frames):
     """What is read back is what was written, to the last bit, raw dtype included."""
     view = make_view(seed, ideal=ideal, truth=truth, frames=frames)

@@ -39,7 +39,7 @@ def test_inverse_undoes_forward(name):
     assert found.sum(axis=1).max() == 8
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(joints=JOINTS)
 def test_inverse_of_any_joints(joints):
     """Whatever the joints, zeros and singular ones included, all solutions that are offered are right."""

@@ -15,6 +15,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from tests import PATIENCE
 from tests.analytic import make_dataset
 from tofcapture.errors import ConfigError
 from tofcapture_model.config import Stage, preset
@@ -139,7 +140,7 @@ def test_machines_that_share_no_folder_go_on_together(dataset, tmp_path):
             )
             for r in range(2)
         ]
-        said = [json.loads(r.communicate(timeout=120)[0].splitlines()[-1]) for r in ranks]
+        said = [json.loads(r.communicate(timeout=PATIENCE)[0].splitlines()[-1]) for r in ranks]
         assert [r.returncode for r in ranks] == [0, 0]
         return said
 

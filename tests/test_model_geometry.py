@@ -63,7 +63,7 @@ def test_doubled_intrinsics_average_to_the_coarse_pixel():
     torch.testing.assert_close(mean, rays(intrinsics(CAMERA), *CAMERA.shape), atol=1e-12, rtol=0)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
 def test_normals_of_a_plane_are_exact(tilt_x, tilt_y):
     """Inverse depth is linear on a plane, so the fit is exact at any tilt, also at the border."""

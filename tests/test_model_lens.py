@@ -94,7 +94,7 @@ def lenses(draw):
         assume(False)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(lenses())
 def test_rays_are_the_cameras(camera):
     """For every lens that is not refused, at the sensor's resolution and at twice that."""
@@ -121,7 +121,7 @@ def test_a_lens_that_nearly_folds_is_refused_before_anything_is_computed(lens):
         TorchDecoder(TofInfo("t", "", lens, np.zeros(3)), lens, torch.device("cpu"))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(lenses())
 def test_every_cue_is_finite_for_every_lens(camera):
     """Also what is expected of the scene beyond the image, where most lenses fold."""

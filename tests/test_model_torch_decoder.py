@@ -146,7 +146,7 @@ def test_what_cannot_be_decoded_is_refused():
         TorchDecoder(replace(info, modulation_hz=(1e8,) * 8), CAMERA, HERE)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 23), st.integers(1, 31), st.floats(0.001, 1))
 def test_holes_get_the_value_of_a_nearest_pixel(seed, height, width, share):
     """As far away as scipy's exact distance says; of several equally near any one will do."""

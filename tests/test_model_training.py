@@ -16,6 +16,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from tests import PATIENCE
 from tests.analytic import make_dataset
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, FormatError
@@ -353,7 +354,7 @@ def test_two_processes_train_together(dataset, tmp_path):
         )
         for r in range(2)
     ]
-    said = [r.communicate(timeout=120)[0] for r in ranks]
+    said = [r.communicate(timeout=PATIENCE)[0] for r in ranks]
     assert [r.returncode for r in ranks] == [0, 0]
     assert {s.split()[-1] for s in said} == {"3"}
     assert (tmp_path / "run" / "model.safetensors").exists()

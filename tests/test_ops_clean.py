@@ -48,7 +48,7 @@ def tilted(slope=0.5, distance=0.8):
 
 
 @given(st.floats(-1.5, 1.5), st.floats(0.3, 1.5))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_denoise_keeps_a_clean_plane(slope, distance):
     """Of a plane with a little noise at least 99.5 % stays, and no NaN is kept."""
     depth = tilted(slope, distance)
@@ -142,7 +142,7 @@ def test_denoise_of_nothing_is_nothing():
 
 
 @given(st.floats(0, 2 * np.pi), st.floats(0, np.radians(60)), st.integers(0, 1000))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_the_dominant_plane_is_found(azimuth, tilt, seed):
     """A plane with 40 % of other points is found to 0.2 degrees and 0.5 mm, whatever its tilt."""
     normal = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)])

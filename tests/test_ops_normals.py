@@ -27,7 +27,7 @@ def angles(found, normal):
 
 
 @given(st.floats(0, 2 * np.pi), st.floats(0, np.radians(80)))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_planes_are_exact_at_any_tilt(azimuth, tilt):
     """Without noise every method gives a plane's normal to 1e-6 rad, unit and facing the camera."""
     normal = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)])

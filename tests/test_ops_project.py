@@ -58,7 +58,7 @@ FRONT = (0.7, -0.09, 0.08, -0.07, 0.1)
 
 
 @given(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6), st.floats(0.4, 1.4))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_a_plane_is_exact_at_pixel_centres(a, b, distance):
     """Depth of a tilted plane comes out to 1e-9 m and its triangles' normals to 1e-6, at 1x, 2x and any other size."""
     normal = np.array([a, b, -1.0]) / np.sqrt(a * a + b * b + 1)

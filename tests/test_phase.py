@@ -90,7 +90,7 @@ def test_wrap_failures_at_a_given_phase_noise():
 
 
 @given(st.floats(0.1, 7.0), st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_decode_inverts_encode(distance, seed):
     """Whatever the distance below 7 m and the order of the channels, decoding gives the distance along the ray back."""
     order = np.random.default_rng(seed).permutation(8)
@@ -111,7 +111,7 @@ def test_decode_survives_the_wrap_of_the_high_frequency():
 
 
 @given(st.floats(0.05, 5.0), st.floats(-0.04, 0.04), st.floats(-0.04, 0.04))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_range_and_radial_are_inverse(distance, x, y):
     """The ellipsoid formula inverts half the path for any light source."""
     light = np.array([x, y, 0.003])

@@ -71,7 +71,7 @@ def oracle(raw, info, celsius, saturated=None):
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(20.0, 70.0), st.booleans())
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_the_fast_decoder_is_the_oracle_to_a_hundredth_of_a_millimetre(seed, celsius, corrected):
     """Any distance in range, any temperature, any order of channels, with and without range errors."""
     rng = np.random.default_rng(seed)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import PATIENCE, alive, until
 from tofcapture.errors import TofError
 from tofcapture.pool import Pool
 
@@ -101,19 +102,8 @@ def test_workers_end_with_whoever_opened_the_pool(tmp_path, end):
         [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     worker = int(owner.stdout.readline())
-    assert _alive(worker)
+    assert alive(worker)
     owner.send_signal(end)
-    said = owner.communicate(timeout=60)[1]
+    said = owner.communicate(timeout=PATIENCE)[1]
     assert "Process Spawn" not in said
-    deadline = time.monotonic() + 60
-    while _alive(worker) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not _alive(worker)
-
-
-def _alive(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    return state != "Z"
+    until(lambda: not alive(worker))

@@ -73,7 +73,7 @@ def test_curved_surfaces_are_smooth():
     assert volume(mesh) == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=5e-3)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10_000), corners=st.integers(3, 40), holes=st.integers(0, 9), flip=st.booleans())
 def test_triangulation_covers_the_polygon(seed, corners, holes, flip):
     """Triangles of a star-shaped polygon with holes sum to its area, all counter-clockwise, P + 2 H - 2 of them."""

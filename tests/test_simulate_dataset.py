@@ -5,11 +5,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import pytest
 
+from tests import until
 from tests.test_sim_world import SMALL
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError
@@ -172,10 +172,7 @@ def test_processes_and_sigkill_give_the_same_bytes(tmp_path, station, whole):
     line = [sys.executable, "-m", "tofcapture", "simulate-dataset", "--suite", "multipath", "--scenes", "2"]
     line += ["--views", "2", "--frames", "2", "--jobs", "2", "--out", str(out), "--station", str(station)]
     run = subprocess.Popen(line, start_new_session=True, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while not list(out.glob("simulation/*.work/recording/views/*/view-*.h5")):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    until(lambda: list(out.glob("simulation/*.work/recording/views/*/view-*.h5")))
     os.killpg(run.pid, signal.SIGKILL)
     run.wait()
     subprocess.run(line, check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)

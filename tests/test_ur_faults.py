@@ -1,4 +1,4 @@
-"""Every fault of the controller, with the real ``ur_rtde`` library against the emulator: named in time, and nothing hangs."""
+"""Every fault of the controller, with the real ``ur_rtde`` library against the emulator: named, and nothing hangs."""
 
 import os
 import signal
@@ -10,14 +10,12 @@ import time
 import numpy as np
 import pytest
 
+from tests import until
 from tests.emulated import THERE, at_home, station_file
 from tofcapture.devices import faults
 from tofcapture.devices.station import open_station
 
 pytest.importorskip("rtde_control", reason="the ur_rtde library is not installed")
-
-LIMIT = 15.0  # s within which a fault has its name
-
 
 MOVING = {
     "protective_stop": faults.ProtectiveStop,
@@ -33,21 +31,19 @@ def _fault_in_motion(emulator, tmp_path, order):
     with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
         at_home(station.arm)
         emulator.order(order, share=0.3)
-        start = time.monotonic()
         with pytest.raises(MOVING[order]) as caught:
             station.arm.move_to(THERE)
-        assert time.monotonic() - start < LIMIT
         assert caught.value.hint
         # The state is kept until a person opens the station anew, and stopping stays allowed.
         with pytest.raises(MOVING[order]):
             station.arm.state()
         station.arm.stop()
-    assert np.abs(np.array(emulator.rest(3)["joints"]) - THERE).max() > 1e-3
+    assert np.abs(np.array(emulator.rest()["joints"]) - THERE).max() > 1e-3
 
 
 @pytest.mark.parametrize("order", ["drop", "freeze"])
 def test_faults_in_motion(emulator, tmp_path, order):
-    """A fault in mid-move has its name in time, and the arm stands still soon after, on its way."""
+    """A fault in mid-move has its name, and the arm stands still soon after, on its way."""
     _fault_in_motion(emulator, tmp_path, order)
 
 
@@ -70,10 +66,8 @@ def test_faults_at_rest(emulator, tmp_path, order):
     """A fault while the arm stands is noticed by the next call."""
     with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
         emulator.order(order)
-        start = time.monotonic()
         with pytest.raises(MOVING[order]):
             _read_on(station.arm)
-        assert time.monotonic() - start < LIMIT
 
 
 # The probe talks first; what it lets pass must hang the library: V, v and O are asked by both.
@@ -83,22 +77,18 @@ HANGS = [("I", 0), ("connect", 1), ("V", 1), ("v", 1), ("O", 1), ("O", 2), ("S",
 @pytest.mark.slow
 @pytest.mark.parametrize(("stage", "skip"), [*HANGS, ("dashboard", 2), ("ready", 0), ("done", 0)])
 def test_the_library_is_never_waited_for(emulator, tmp_path, stage, skip):
-    """A controller that falls silent once the library talks to it is named silent in time, though the library hangs."""
+    """A controller that falls silent once the library talks to it is named silent, though the library hangs."""
     emulator.order("mute", stage=stage, skip=skip)
-    start = time.monotonic()
     with pytest.raises(faults.ControllerSilent), open_station(station_file(tmp_path, emulator)):
         pass
-    assert time.monotonic() - start < LIMIT
 
 
 @pytest.mark.slow
 def test_dead_script(emulator, tmp_path):
-    """A controller that never starts the script is named so in time."""
+    """A controller that never starts the script is named so."""
     emulator.order("mute", stage="script")
-    start = time.monotonic()
     with pytest.raises(faults.ProgramStopped), open_station(station_file(tmp_path, emulator)):
         pass
-    assert time.monotonic() - start < LIMIT
 
 
 @pytest.mark.slow
@@ -106,12 +96,18 @@ def test_killed_driver(emulator, tmp_path):
     """SIGKILL of the driver's process in mid-move is named, and the controller's watchdog stops the arm on its way."""
     with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
         at_home(station.arm)
-        timer = threading.Timer(0.5, os.kill, (station.arm.pid, signal.SIGKILL))
-        timer.start()
+        emulator.order("slow", speed=0.2)
+
+        def kill():
+            until(lambda: emulator.order("status")["moving"])
+            os.kill(station.arm.pid, signal.SIGKILL)
+
+        thread = threading.Thread(target=kill)
+        thread.start()
         with pytest.raises(faults.HostLost, match="exit status -9"):
             station.arm.move_to(THERE)
-        timer.join()
-        assert np.abs(np.array(emulator.rest(3)["joints"]) - THERE).max() > 1e-3
+        thread.join()
+        assert np.abs(np.array(emulator.rest()["joints"]) - THERE).max() > 1e-3
 
 
 @pytest.mark.slow
@@ -127,11 +123,9 @@ def test_lost_station(emulator, tmp_path, how):
         f"with open_station(Path({str(file)!r}), allow_motion=True) as s: s.arm.move_to({THERE.tolist()})"
     )
     child = subprocess.Popen([sys.executable, "-c", program])
-    while not emulator.order("status")["moving"]:
-        time.sleep(0.02)
-    time.sleep(0.3)
+    until(lambda: emulator.order("status")["moving"])
     child.send_signal(how)
-    assert np.abs(np.array(emulator.rest(4.5)["joints"]) - THERE).max() > 0.1
+    assert np.abs(np.array(emulator.rest()["joints"]) - THERE).max() > 0.1
     child.kill()
     child.wait()
     emulator.calm()

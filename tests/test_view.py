@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests import PATIENCE, until
 from tests.test_files_shard import RIG, write
 from tofcapture.cli import main
 from tofcapture.colours import GOOD, GREY, MASK, Scale, palette, scale_for
@@ -127,7 +128,7 @@ def test_palettes_are_those_of_matplotlib(name):
 
 
 @given(st.floats(-1e3, 1e3), st.floats(1e-3, 1e3), st.sampled_from([1.0, 0.5]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_a_scale_spans_its_colours(low, span, gamma):
     """The ends have the first and the last colour, beyond them nothing changes, NaN is grey."""
     scale = Scale("viridis", low, low + span, "mm", gamma)
@@ -224,7 +225,7 @@ def server(dataset, tmp_path):
 def test_page_is_for_this_machine_only(server):
     """It listens on the loopback interface, refuses other names, and its policy lets the browser ask nobody else."""
     assert server.server_address[0] == "127.0.0.1"
-    link = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    link = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
     for host, path, status in (
         ("127.0.0.1", "/", 303),
         ("localhost", "/view.rrd", 200),
@@ -291,10 +292,7 @@ def test_rerun_leaves_no_process_behind(tmp_path):
     before = _servers()
     save_page(tmp_path)
     assert "const own" in (tmp_path / "index.html").read_text()
-    end = time.monotonic() + 10
-    while _servers() - before and time.monotonic() < end:
-        time.sleep(0.1)
-    assert _servers() <= before
+    until(lambda: _servers() <= before)
 
 
 def _servers():

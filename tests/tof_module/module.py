@@ -173,6 +173,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--reset-in", type=int, action="append", default=[], metavar="N", help="start anew in burst N"
     )
+    parser.add_argument("--pull-in", type=int, metavar="N", help="end in burst N, as a pulled cable does")
     return parser.parse_args()
 
 
@@ -181,7 +182,11 @@ def main() -> None:
     args = _arguments()
     width, height = (int(v) for v in args.size.split("x"))
     info = simulated_info(width, height, boot=secrets.randbits(32))
-    core = ModuleCore(info, synthetic(info, args.seed), args.protocol, frozenset(args.reset_in))
+    core = ModuleCore(
+        info, synthetic(info, args.seed), args.protocol, frozenset({*args.reset_in, args.pull_in})
+    )
+    if args.pull_in is not None:
+        core.reset = lambda _: os._exit(0)
     noise = Noise.every(np.random.default_rng([args.seed, 1]), args.noise) if args.noise else None
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     clock = clock_us(args.drift)

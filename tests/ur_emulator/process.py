@@ -8,11 +8,11 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from tests import PATIENCE, until
 from tofcapture.errors import DeviceError
 
 _ROOT = Path(__file__).parents[2]
@@ -53,7 +53,7 @@ class Emulator:
         if not line:
             self.__exit__(None, None, None)
             raise DeviceError(f"the emulator on {self.host} did not start", hint="is the address taken?")
-        self._control = socket.create_connection((self.host, json.loads(line)["control"]), timeout=5)
+        self._control = socket.create_connection((self.host, json.loads(line)["control"]), timeout=PATIENCE)
         return self
 
     def __exit__(
@@ -88,28 +88,12 @@ class Emulator:
             raise DeviceError(f"emulator: {status['error']}")
         return status
 
-    def calm(self, seconds: float = 5.0) -> dict[str, Any]:
-        """Lift all faults and wait until the arm is at rest; the robot's status then.
-
-        Raises
-        ------
-        DeviceError
-            It still moves.
-        """
+    def calm(self) -> dict[str, Any]:
+        """Lift all faults and wait until the arm is at rest; the robot's status then."""
         self.order("lift")
-        return self.rest(seconds)
+        return self.rest()
 
-    def rest(self, seconds: float) -> dict[str, Any]:
-        """Wait until the arm is at rest; the robot's status then.
-
-        Raises
-        ------
-        DeviceError
-            It still moves.
-        """
-        end = time.monotonic() + seconds
-        while (status := self.order("status"))["moving"]:
-            if time.monotonic() > end:
-                raise DeviceError(f"the emulated arm still moves after {seconds} s")
-            time.sleep(0.05)
-        return status
+    def rest(self) -> dict[str, Any]:
+        """Wait until the arm is at rest; the robot's status then."""
+        until(lambda: not self.order("status")["moving"])
+        return self.order("status")

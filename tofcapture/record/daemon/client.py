@@ -12,18 +12,18 @@ from typing import Any
 from tofcapture.errors import BusyError, DataError, DeviceError, TofError, UsageError
 from tofcapture.record.daemon.settings import state_folder
 
-_TIMEOUT = 5.0  # s
+PATIENCE = 5.0  # s that the daemon may take to answer
 _ERRORS = {404: DataError, 409: BusyError, 422: UsageError}
 
 
 class _UnixConnection(http.client.HTTPConnection):
     def __init__(self, path: Path) -> None:
-        super().__init__("localhost", timeout=_TIMEOUT)
+        super().__init__("localhost", timeout=PATIENCE)
         self._path = path
 
     def connect(self) -> None:
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self.sock.settimeout(_TIMEOUT)
+        self.sock.settimeout(PATIENCE)
         self.sock.connect(str(self._path))
 
 
