@@ -281,7 +281,7 @@ def test_no_colour_when_asked(tmp_path):
 
 def test_ctrl_c_is_clean(tmp_path):
     """An interrupted command says so in two lines, exits with 130 and leaves no half-written file."""
-    words = [sys.executable, "-m", "tofcapture", "record", "--scene", "mug", "--out", str(tmp_path / "rec")]
+    words = [sys.executable, "-m", "tofcapture", "record", "--calibration", "--out", str(tmp_path / "rec")]
     run = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
     until((tmp_path / "rec" / "journal.sqlite").exists)
     run.send_signal(signal.SIGINT)

@@ -60,15 +60,9 @@ def all_commands() -> dict[str, Command]:
 
 
 def parser(commands: dict[str, Command], *, named: bool = True) -> argparse.ArgumentParser:
-    """Build the parser of the given commands.
+    """Build the parser of the given commands, by name.
 
-    Parameters
-    ----------
-    commands
-        By name.
-    named
-        The command line names one of them. Without it only the list of commands is of use, and no command declares arguments: some
-        import numpy for that.
+    Not ``named``, only the list of commands is of use: no command declares arguments, for some import numpy for that.
     """
     top = _Parser(prog="tofcapture", description=DESCRIPTION, epilog=EXIT_CODES)
     top.add_argument("--version", action="version", version=f"tofcapture {__version__}")

@@ -15,46 +15,28 @@ if TYPE_CHECKING:
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "recordings", nargs="+", type=Path, metavar="RECORDING", help="folders that record filled"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="the dataset's folder")
-    rig = parser.add_mutually_exclusive_group()
-    rig.add_argument(
-        "--rig", type=Path, metavar="TOML", help="rig to use (default: RECORDING/rig.toml, written by align)"
-    )
-    rig.add_argument(
-        "--true-rig", action="store_true", help="use the rig that the simulator knows (simulated recordings)"
-    )
-    parser.add_argument(
-        "--crop-radius", type=float, metavar="M", help="object within this radius, metres (default: 0.35)"
-    )
-    parser.add_argument("--far", type=float, metavar="M", help="deepest ground truth, metres (default: 2.0)")
-    parser.add_argument(
-        "--scales",
-        nargs="+",
-        type=int,
-        choices=(1, 2, 4),
-        default=(1, 2),
-        metavar="S",
-        help="resolutions of the ground truth, in ToF images: 1 2 4 adds 4x (default: 1 2, which are always there)",
-    )
-    parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core, at most 4)")
-    parser.add_argument(
-        "--engine", choices=("process", "dask"), default="process", help="who builds (default: process)"
-    )
-    parser.add_argument(
-        "--scheduler", metavar="ADDRESS", help="of a Dask cluster, for example tcp://host:8786"
-    )
+    add, rig = parser.add_argument, parser.add_mutually_exclusive_group()
     batch = parser.add_mutually_exclusive_group()
-    batch.add_argument(
-        "--part", metavar="I/N", help="build part I of N of the scenes; the last to end finishes the dataset"
+    add("recordings", nargs="+", type=Path, metavar="RECORDING", help="folders that record filled")
+    add("--out", type=Path, required=True, metavar="DIR", help="the dataset's folder")
+    which = "rig to use (default: RECORDING/rig.toml, written by align)"
+    rig.add_argument("--rig", type=Path, metavar="TOML", help=which)
+    which = "use the rig that the simulator knows (simulated recordings)"
+    rig.add_argument("--true-rig", action="store_true", help=which)
+    radius = "object within this radius, metres (default: 0.35)"
+    add("--crop-radius", type=float, metavar="M", help=radius)
+    add("--far", type=float, metavar="M", help="deepest ground truth, metres (default: 2.0)")
+    scales = (
+        "resolutions of the ground truth, in ToF images: 1 2 4 adds 4x (default: 1 2, which are always there)"
     )
-    batch.add_argument(
-        "--finish",
-        action="store_true",
-        help="build nothing, write manifest and card of the shards that are there",
-    )
+    add("--scales", nargs="+", type=int, choices=(1, 2, 4), default=(1, 2), metavar="S", help=scales)
+    add("--jobs", type=int, metavar="N", help="processes (default: one per core, at most 4)")
+    add("--engine", choices=("process", "dask"), default="process", help="who builds (default: process)")
+    add("--scheduler", metavar="ADDRESS", help="of a Dask cluster, for example tcp://host:8786")
+    part = "build part I of N of the scenes; the last to end finishes the dataset"
+    batch.add_argument("--part", metavar="I/N", help=part)
+    finish = "build nothing, write manifest and card of the shards that are there"
+    batch.add_argument("--finish", action="store_true", help=finish)
 
 
 def _positive(value: float | None, name: str) -> dict[str, Any]:

@@ -52,7 +52,7 @@ def _announce(socket: Path, url: str | None) -> None:
 
 
 def _configure_status(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--state", type=Path, metavar="FOLDER", help="the daemon's folder")
+    _configure_stop(parser)
     parser.add_argument("--url", action="store_true", help="print the address of its page, token included")
 
 

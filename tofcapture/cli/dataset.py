@@ -11,9 +11,8 @@ from tofcapture.errors import ConfigError
 
 
 def _configure_check(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "path", type=Path, metavar="PATH", help="view file, shard, recording, dataset or cache"
-    )
+    what = "view file, shard, recording, dataset or cache"
+    parser.add_argument("path", type=Path, metavar="PATH", help=what)
 
 
 def _check(args: argparse.Namespace) -> Outcome:
@@ -41,11 +40,11 @@ def _check(args: argparse.Namespace) -> Outcome:
 
 
 def _configure_pack(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that build-dataset filled")
-    parser.add_argument("--split", default="train", help="train, val or test (default train)")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="CACHE", help="the cache's folder; completed if it exists"
-    )
+    add = parser.add_argument
+    add("dataset", type=Path, metavar="DATASET", help="folder that build-dataset filled")
+    add("--split", default="train", help="train, val or test (default train)")
+    folder = "the cache's folder; completed if it exists"
+    add("--out", type=Path, required=True, metavar="CACHE", help=folder)
 
 
 def _pack(args: argparse.Namespace) -> Outcome:
@@ -69,18 +68,12 @@ def _pack(args: argparse.Namespace) -> Outcome:
 
 
 def _configure_export(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", type=Path, metavar="PATH", help="dataset or shard")
-    parser.add_argument("--format", required=True, choices=("ply", "png16", "mcap"), dest="kind")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder; completed if it was begun"
-    )
-    parser.add_argument(
-        "--unit",
-        type=float,
-        default=1 / 8000,
-        metavar="METRES",
-        help="step of PNG depth (default 0.000125: up to 8.19 m; 0.0001 holds 6.55 m)",
-    )
+    add = parser.add_argument
+    add("path", type=Path, metavar="PATH", help="dataset or shard")
+    add("--format", required=True, choices=("ply", "png16", "mcap"), dest="kind")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder; completed if it was begun")
+    step = "step of PNG depth (default 0.000125: up to 8.19 m; 0.0001 holds 6.55 m)"
+    add("--unit", type=float, default=1 / 8000, metavar="METRES", help=step)
 
 
 def _export(args: argparse.Namespace) -> Outcome:

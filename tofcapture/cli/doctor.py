@@ -17,15 +17,15 @@ import sqlite3
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import requires
 from pathlib import Path
 
 from tofcapture import __version__
 from tofcapture.cli.kit import Command, Outcome
-from tofcapture.cli.probe import Finding, attempt, probe
+from tofcapture.cli.probe import PROBES, Finding, attempt, graded, installed_version, probe
 from tofcapture.cli.setup import bundled_path, describe_weights, station_path
 from tofcapture.errors import ConfigError, TofError
 
@@ -33,9 +33,7 @@ Examination = Callable[[], Iterator[Finding]]
 Versions = Callable[[str], str | None]
 
 _PROBED = {"open3d", "open3d-cpu", "libusb-package", "ur-rtde", "nxlib", "opencv-python-headless"}
-_OPENCV = [
-    f"opencv-{kind}" for kind in ("python", "python-headless", "contrib-python", "contrib-python-headless")
-]
+_OPENCV = [f"opencv-{k}" for k in ("python", "python-headless", "contrib-python", "contrib-python-headless")]
 _NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "sshfs", "fuse.sshfs", "9p", "afs", "ceph", "glusterfs"}
 _VIEW = 24_000_000  # bytes, of a full-size view
 _SLOW_VIEW, _SLOW_COMMIT = 3.0, 0.1  # s; a view takes some seconds in all, a commit is done ten times for it
@@ -44,35 +42,27 @@ _BEGINNING = 1_700_000_000  # s; earlier, the clock was never set
 _TIME_ERROR, _UNSYNCHRONISED = 5, 0x40  # adjtimex(2)
 
 
-def installed_version(name: str) -> str | None:
-    """Version of an installed package; ``None`` when it is not installed."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
-
-
 def check_python(installed: Versions = installed_version) -> Iterator[Finding]:
-    """Python, the package as it runs and as it is installed, its program, SQLite."""
-    old = sys.version_info < (3, 11)
-    yield _graded("python", "FAIL", platform.python_version(), "install Python 3.11 or newer" if old else "")
+    """Look at Python, the package as it runs and as it is installed, its program, SQLite."""
+    advice = "install Python 3.11 or newer" if sys.version_info < (3, 11) else ""
+    yield graded("python", platform.python_version(), advice, "FAIL")
     found = installed("tofcapture")
     if found is None:
-        yield Finding("tofcapture", "FAIL", f"{__version__} runs, but is not installed", "pip install .")
+        yield graded("tofcapture", f"{__version__} runs, but is not installed", "pip install .", "FAIL")
     elif found != __version__:
-        yield Finding("tofcapture", "FAIL", f"{__version__} runs, {found} is installed", "install again")
+        yield graded("tofcapture", f"{__version__} runs, {found} is installed", "install again", "FAIL")
     else:
-        yield Finding("tofcapture", "PASS", __version__)
+        yield graded("tofcapture", __version__)
     program = shutil.which("tofcapture")
     advice = "" if program else "activate its environment"
-    yield _graded("program", "WARN", program or "tofcapture is not on the PATH", advice)
+    yield graded("program", program or "tofcapture is not on the PATH", advice)
     # Upserts came with 3.24; the journal needs them.
-    old = sqlite3.sqlite_version_info < (3, 24)
-    yield _graded("sqlite", "FAIL", sqlite3.sqlite_version, "use a newer Python build" if old else "")
+    advice = "use a newer Python build" if sqlite3.sqlite_version_info < (3, 24) else ""
+    yield graded("sqlite", sqlite3.sqlite_version, advice, "FAIL")
 
 
 def check_libraries(installed: Versions = installed_version) -> Iterator[Finding]:
-    """Every library that the package asks for, with the extra that brings it."""
+    """Look for every library that the package asks for, and name the extra that brings it."""
     seen = set(_PROBED)
     for line in requires("tofcapture") or () if installed_version("tofcapture") else ():
         name = re.match(r"[\w.-]+", line)[0]  # type: ignore[index]
@@ -85,11 +75,11 @@ def check_libraries(installed: Versions = installed_version) -> Iterator[Finding
         advice = f"pip install 'tofcapture[{extra[1]}]'" if extra else "pip install tofcapture"
         found = installed(name)
         if found is None:
-            yield Finding(name, verdict, "not installed", advice)
+            yield graded(name, "not installed", advice, verdict)
         elif least and _numbers(found) < _numbers(least[1]):
-            yield Finding(name, verdict, f"{found}, older than {least[1]}", advice)
+            yield graded(name, f"{found}, older than {least[1]}", advice, verdict)
         else:
-            yield Finding(name, "PASS", found)
+            yield graded(name, found)
 
 
 def _numbers(text: str) -> list[int]:
@@ -98,59 +88,58 @@ def _numbers(text: str) -> list[int]:
 
 
 def check_wheels(installed: Versions = installed_version) -> Iterator[Finding]:
-    """Wheels that spoil each other: two of OpenCV, a torchvision of another torch."""
+    """Find wheels that spoil each other: two of OpenCV, a torchvision of another torch."""
     wheels = [n for n in _OPENCV if installed(n)]
     if len(wheels) > 1:
         advice = f"pip uninstall -y {' '.join(wheels)} && pip install opencv-python-headless"
-        yield Finding("opencv", "WARN", f"{' and '.join(wheels)} are both installed", advice)
+        yield graded("opencv", f"{' and '.join(wheels)} are both installed", advice)
     elif wheels:
-        yield Finding("opencv", "PASS", f"{wheels[0]} {installed(wheels[0])}")
+        yield graded("opencv", f"{wheels[0]} {installed(wheels[0])}")
     else:
-        yield Finding("opencv", "WARN", "not installed", "pip install 'tofcapture[capture]'")
+        yield graded("opencv", "not installed", "pip install 'tofcapture[capture]'")
     torch, vision = installed("torch"), installed("torchvision")
     if torch and vision:
         # Else: "operator torchvision::nms does not exist". torch 2.N goes with torchvision 0.(N + 15).
         same_build = torch.partition("+")[2] == vision.partition("+")[2]
         fits = same_build and int(vision.split(".")[1]) == int(torch.split(".")[1]) + 15
         found = f"{vision}, {'matches' if fits else 'does not belong to'} torch {torch}"
-        advice = "" if fits else "pip uninstall torchvision: it is not needed"
-        yield _graded("torchvision", "WARN", found, advice)
+        yield graded("torchvision", found, "" if fits else "pip uninstall torchvision: it is not needed")
 
 
 def check_weights() -> Iterator[Finding]:
-    """The trained network that predict, evaluate and demo take when none is named."""
-    path = bundled_path()
-    if path is None:
-        yield Finding("weights", "WARN", "no trained network is bundled", "name one with --weights")
-    else:
+    """Look at the trained network that predict, evaluate and demo take when none is named."""
+    if path := bundled_path():
         yield attempt("weights", lambda: f"bundled: {describe_weights(path)}", "WARN")
+    else:
+        yield graded("weights", "no trained network is bundled", "name one with --weights")
 
 
 def check_folder(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> Iterator[Finding]:
-    """Space, permission and kind of the disk where recordings would go."""
+    """Look at space, permission and kind of the disk where recordings would go."""
     free = shutil.disk_usage(folder).free / 1e9
     # A scene of 25 views takes 0.3 to 0.6 GB.
     advice = "" if free > 5 else "a scene takes 0.5 GB: free some"
-    yield _graded("disk", "WARN" if free > 1 else "FAIL", f"{free:.1f} GB free in {folder}", advice)
+    yield graded("disk", f"{free:.1f} GB free in {folder}", advice, "WARN" if free > 1 else "FAIL")
     if not os.access(folder, os.W_OK):
-        yield Finding("folder", "WARN", f"{folder} cannot be written", "change to a folder of yours")
+        yield graded("folder", f"{folder} cannot be written", "change to a folder of yours")
         return
-    yield Finding("folder", "PASS", f"{folder} can be written")
+    yield graded("folder", f"{folder} can be written")
     kind = _file_system(folder, mounts)
     if kind in _NETWORK:
         advice = "record on a local disk: the journal's locks do not hold over a network"
-        yield Finding("file system", "FAIL", f"{kind}: a network's", advice)
+        yield graded("file system", f"{kind}: a network's", advice, "FAIL")
     elif kind in {"tmpfs", "ramfs"}:
-        yield Finding("file system", "WARN", f"{kind}: gone after a restart", "record on a disk")
+        yield graded("file system", f"{kind}: gone after a restart", "record on a disk")
     elif kind:
-        yield Finding("file system", "PASS", kind)
+        yield graded("file system", kind)
     inodes = os.statvfs(folder)
     if inodes.f_files and inodes.f_favail < 10_000:
-        yield Finding("inodes", "WARN", f"{inodes.f_favail} left", "remove small files: df -i shows where")
+        yield graded("inodes", f"{inodes.f_favail} left", "remove small files: df -i shows where")
+    yield from check_disk_speed(folder)
 
 
 def _file_system(folder: Path, mounts: Path) -> str:
-    """Kind of the file system that holds a folder; empty when unknown."""
+    """Find the kind of the file system that holds a folder; empty when unknown."""
     here, best, kind = folder.resolve(), -1, ""
     for line in mounts.read_text(encoding="utf-8").splitlines() if mounts.exists() else ():
         _, at, name, *_ = line.split(" ")
@@ -162,8 +151,6 @@ def _file_system(folder: Path, mounts: Path) -> str:
 
 def check_disk_speed(folder: Path, clock: Callable[[], float] = time.monotonic) -> Iterator[Finding]:
     """Write a view and some commits, all of it to the disk."""
-    if not os.access(folder, os.W_OK):
-        return
     seconds = []
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -174,37 +161,34 @@ def check_disk_speed(folder: Path, clock: Callable[[], float] = time.monotonic) 
                 os.fsync(file.fileno())
                 seconds.append(clock() - start)
     except OSError as err:
-        yield Finding("disk speed", "FAIL", f"{folder}: {err}", "look at the system's log; is it full?")
+        yield graded("disk speed", f"{folder}: {err}", "look at the system's log; is it full?", "FAIL")
         return
     view, commit = seconds[0], sorted(seconds[1:])[2]
     found = f"a view in {view:.2f} s, a commit in {1e3 * commit:.1f} ms, both synced"
     slow = view > _SLOW_VIEW or commit > _SLOW_COMMIT
-    advice = "each view waits for this: take another disk, or end what else writes to it" if slow else ""
-    yield _graded("disk speed", "WARN", found, advice)
+    advice = "each view waits for this: take another disk, or end what else writes to it"
+    yield graded("disk speed", found, advice if slow else "")
 
 
 def read_clocks() -> tuple[float, float]:
     """Read monotonic and wall seconds, of the pair least apart of five."""
-    pairs = []
-    for _ in range(5):
-        a, wall, b = time.monotonic(), time.time(), time.monotonic()
-        pairs.append((b - a, (a + b) / 2, wall))
-    return min(pairs)[1:]
+    pairs = [(time.monotonic(), time.time(), time.monotonic()) for _ in range(5)]
+    before, wall, after = min(pairs, key=lambda p: p[2] - p[0])
+    return (before + after) / 2, wall
 
 
 def check_clock(clocks: Callable[[], tuple[float, float]] = read_clocks) -> Iterator[Finding]:
-    """Time of day: set, running as fast as the monotonic clock, synchronised."""
+    """Look at the time of day: set, running as fast as the monotonic clock, synchronised."""
     first = clocks()
     if first[1] < _BEGINNING:
         today = time.strftime("%Y-%m-%d", time.gmtime(first[1]))
-        yield Finding("clock", "FAIL", today, "set the clock: timedatectl set-ntp true")
+        yield graded("clock", today, "set the clock: timedatectl set-ntp true", "FAIL")
         return
     time.sleep(0.3)
     last = clocks()
     drift = (last[1] - first[1]) - (last[0] - first[0])
     advice = "" if abs(drift) < 2e-3 else "something sets the clock by jumps; let one time service do it"
-    found = f"wall and monotonic clock differ by {1e3 * drift:+.2f} ms over 0.3 s"
-    yield _graded("clock", "WARN", found, advice)
+    yield graded("clock", f"wall and monotonic clock differ by {1e3 * drift:+.2f} ms over 0.3 s", advice)
     if sys.platform != "linux":
         return
     timex = ctypes.create_string_buffer(512)  # modes = 0: read only
@@ -214,71 +198,67 @@ def check_clock(clocks: Callable[[], tuple[float, float]] = read_clocks) -> Iter
         state = -1
     status = int.from_bytes(timex.raw[40:44], sys.byteorder)
     if state < 0:
-        yield Finding("time service", "WARN", "the kernel does not say", "timedatectl shows more")
+        yield graded("time service", "the kernel does not say", "timedatectl shows more")
     elif state == _TIME_ERROR or status & _UNSYNCHRONISED:
         advice = "timedatectl set-ntp true, or start chrony: file times and UTC stamps depend on it"
-        yield Finding("time service", "WARN", "the clock is not synchronised", advice)
+        yield graded("time service", "the clock is not synchronised", advice)
     else:
-        yield Finding("time service", "PASS", "the clock is synchronised")
+        yield graded("time service", "the clock is synchronised")
 
 
 def check_memory() -> Iterator[Finding]:
-    """Shared memory: processes hand arrays over in it, and containers give 64 MB."""
+    """Look at shared memory: processes hand arrays over in it, and containers give 64 MB."""
     shared = Path("/dev/shm")  # noqa: S108  where the kernel keeps it
     if shared.is_dir():
         free = shutil.disk_usage(shared).free
         advice = "" if free >= _SHARED else "give the container --shm-size=1g, or free /dev/shm"
-        yield _graded("shared memory", "WARN", f"{free / 1e6:.0f} MB free", advice)
+        yield graded("shared memory", f"{free / 1e6:.0f} MB free", advice)
 
 
 def check_ports(dev: Path = Path("/dev")) -> Iterator[Finding]:
-    """Serial ports, and whether this user may open them."""
+    """Look for serial ports, and whether this user may open them."""
     named = sorted((dev / "serial" / "by-id").glob("*"))
     ports = named or sorted([*dev.glob("ttyUSB*"), *dev.glob("ttyACM*")])
     if not ports:
-        yield Finding("serial ports", "PASS", "none; only a serial ToF module needs one")
+        yield graded("serial ports", "none; only a serial ToF module needs one")
     for port in ports:
         if os.access(port, os.R_OK | os.W_OK):
-            yield Finding(f"port {port.name}", "PASS", "can be opened")
+            yield graded(f"port {port.name}", "can be opened")
             continue
         try:
             group = grp.getgrgid(port.stat().st_gid).gr_name
             advice = f"sudo usermod -aG {group} $USER, then log in again"
         except (KeyError, OSError):
             advice = f"ask the owner of {port}"
-        yield Finding(f"port {port.name}", "WARN", "is not ours to open", advice)
+        yield graded(f"port {port.name}", "is not ours to open", advice)
 
 
 def check_daemon() -> Iterator[Finding]:
-    """The daemon's folder: ours alone, its socket's path short enough; and whether one runs."""
+    """Look at the daemon's folder: ours alone, its socket's path short enough; and whether one runs."""
     from tofcapture.record.daemon.client import ask
     from tofcapture.record.daemon.settings import state_folder
 
-    state, what = state_folder(None), "daemon folder"
+    state = state_folder(None)
     near = next(p for p in (state.root, *state.root.parents) if p.exists())
-    info, yours = near.stat(), "set TOFCAPTURE_STATE to a folder of yours"
+    info, found, advice = near.stat(), str(state.root), "set TOFCAPTURE_STATE to a folder of yours"
     if not state.socket_fits:
+        found = f"{state.socket} is too long for a socket"
         advice = "set TOFCAPTURE_STATE to a shorter folder"
-        yield Finding(what, "WARN", f"{state.socket} is too long for a socket", advice)
     elif near == state.root and info.st_uid != os.getuid():
-        yield Finding(what, "WARN", f"{near} belongs to another user", yours)
+        found = f"{near} belongs to another user"
     elif near == state.root and info.st_mode & 0o077:
-        yield Finding(what, "WARN", f"others can look into {near}", f"chmod 700 {near}")
+        found, advice = f"others can look into {near}", f"chmod 700 {near}"
     elif not os.access(near, os.W_OK):
-        yield Finding(what, "WARN", f"{state.root} cannot be made", yours)
+        found = f"{state.root} cannot be made"
     else:
-        yield Finding(what, "PASS", str(state.root))
+        advice = ""
+    yield graded("daemon folder", found, advice)
+    if not advice:
         try:
-            found = ask("GET", "/v1/state", state=state.root)
-            runs = f"one runs: {found['phase']}, recordings in {found['root']}"
+            known = ask("GET", "/v1/state", state=state.root)
+            yield graded("daemon", f"one runs: {known['phase']}, recordings in {known['root']}")
         except TofError:
-            runs = "none runs"
-        yield Finding("daemon", "PASS", runs)
-
-
-def _graded(what: str, verdict: str, found: str, advice: str) -> Finding:
-    """A finding that is bad where there is advice."""
-    return Finding(what, verdict if advice else "PASS", found, advice)
+            yield graded("daemon", "none runs")
 
 
 def examine(examination: Examination) -> list[Finding]:
@@ -286,22 +266,9 @@ def examine(examination: Examination) -> list[Finding]:
     try:
         return list(examination())
     except Exception as err:
-        hint = err.hint if isinstance(err, TofError) else ""
+        advice = getattr(err, "hint", "") or "this is a fault of the doctor"
         name = getattr(examination, "__name__", "check")
-        found = f"{type(err).__name__}: {err}"
-        return [Finding(name, "FAIL", found, hint or "this is a fault of the doctor")]
-
-
-def examinations(folder: Path, station: str, opening: str) -> tuple[list[Examination], ...]:
-    """List what is looked at: quick, then in other processes, then alone, when nothing else runs."""
-    # A UR arm's handshake may take seconds at each of its stages.
-    patience = 180.0 if opening else 90.0
-    names = ("open3d", "ur-rtde", "nxlib", "drivers", "commands")
-    probes: list[Examination] = [lambda n=n: iter(probe(n)) for n in names]  # type: ignore[misc]
-    probes.append(lambda: iter(probe("station", station, opening, timeout=patience)))
-    quick: list[Examination] = [check_python, check_libraries, check_wheels, check_weights]
-    alone: list[Examination] = [lambda: check_folder(folder), lambda: check_disk_speed(folder)]
-    return quick, probes, [*alone, check_clock, check_memory, check_ports, check_daemon]
+        return [Finding(name, "FAIL", f"{type(err).__name__}: {err}", advice)]
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -316,14 +283,15 @@ def _run(args: argparse.Namespace) -> Outcome:
     if not folder.is_dir():
         raise ConfigError(f"{folder}: expected a folder", hint="make it, or name another with --folder")
     station = str(station_path(args.station)[0] or "")
-    quick, probes, alone = examinations(folder, station, "open" if args.open else "")
-    with ThreadPoolExecutor(max_workers=len(probes)) as pool:
-        probed = list(pool.map(examine, probes))
-    groups = [*map(examine, quick), *probed, *map(examine, alone)]
-    return _outcome([finding for group in groups for finding in group])
-
-
-def _outcome(findings: Sequence[Finding]) -> Outcome:
+    quick: tuple[Examination, ...] = (check_python, check_libraries, check_wheels, check_weights)
+    # The disk's speed and the clocks are measured when nothing else runs.
+    alone: tuple[Examination, ...] = (check_clock, check_memory, check_ports, check_daemon)
+    with ThreadPoolExecutor(max_workers=len(PROBES)) as pool:
+        there = {"station": (station, "open" if args.open else "")}
+        probed = list(pool.map(lambda name: probe(name, *there.get(name, ())), PROBES))
+    disk = examine(lambda: check_folder(folder))
+    groups = [*map(examine, quick), *probed, disk, *map(examine, alone)]
+    findings = [finding for group in groups for finding in group]
     width = max(len(f.what) for f in findings)
     lines = []
     for f in findings:

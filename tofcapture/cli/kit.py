@@ -51,10 +51,7 @@ class Report(Protocol):
 def progress() -> Iterator[Report]:
     """Show progress on stderr for the duration of a command: bars on a terminal, now and then a line elsewhere.
 
-    Yields
-    ------
-    Report
-        One bar per ``what``. The time left counts from what was done at the first call: work found done took no time.
+    There is one bar per ``what``. The time left counts from what was done at the first call: work found done took no time.
     """
     if sys.stderr.isatty():
         yield from _bars()
@@ -111,28 +108,16 @@ def _lines() -> Report:
 
 
 def _bars() -> Iterator[Report]:
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TaskID,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("ETA"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[text]}"),
+        *(rich.TextColumn("{task.description}"), rich.BarColumn(), rich.MofNCompleteColumn()),
+        *(rich.TimeElapsedColumn(), rich.TextColumn("ETA"), rich.TimeRemainingColumn()),
+        rich.TextColumn("{task.fields[text]}"),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        tasks: dict[str, TaskID] = {}
+    with rich.Progress(*columns, console=Console(stderr=True)) as bar:
+        tasks: dict[str, rich.TaskID] = {}
 
         def report(what: str, done: float, total: float, text: str = "", /) -> None:
             if what not in tasks:

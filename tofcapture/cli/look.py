@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tofcapture.cli.kit import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome, progress, table
 from tofcapture.errors import UsageError
 
 if TYPE_CHECKING:
@@ -19,24 +19,15 @@ _SHEET, _RERUN = 12, 100  # shots
 
 
 def _configure_view(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "path",
-        type=Path,
-        metavar="PATH",
-        help="recording, view file, dataset, shard, folder of predict, rig.toml or evidence.json",
-    )
-    how = parser.add_mutually_exclusive_group()
-    how.add_argument(
-        "--png", type=Path, metavar="FILE", help="write a contact sheet; needs no screen and no Rerun"
-    )
+    add, how = parser.add_argument, parser.add_mutually_exclusive_group()
+    path = "recording, view file, dataset, shard, folder of predict, rig.toml or evidence.json"
+    add("path", type=Path, metavar="PATH", help=path)
+    sheet = "write a contact sheet; needs no screen and no Rerun"
+    how.add_argument("--png", type=Path, metavar="FILE", help=sheet)
     how.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a Rerun file and show nothing")
     how.add_argument("--web", action="store_true", help="show in a browser of this machine, not in a window")
-    parser.add_argument(
-        "--views",
-        type=int,
-        metavar="N",
-        help=f"show N views at most, spread evenly (default {_SHEET} for --png, else {_RERUN})",
-    )
+    most = f"show N views at most, spread evenly (default {_SHEET} for --png, else {_RERUN})"
+    add("--views", type=int, metavar="N", help=most)
 
 
 def _view(args: argparse.Namespace) -> Outcome:
@@ -58,7 +49,6 @@ def _view(args: argparse.Namespace) -> Outcome:
 
 
 def _written(source: Source, path: Path, most: int, *, as_sheet: bool = False) -> Outcome:
-    from tofcapture.cli.kit import progress
     from tofcapture.viz.rerun_file import write_rrd
     from tofcapture.viz.sheet import write_sheet
 
@@ -71,33 +61,18 @@ def _written(source: Source, path: Path, most: int, *, as_sheet: bool = False) -
 
 
 def _configure_figure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kind", choices=KINDS, metavar="KIND", help=", ".join(KINDS))
-    parser.add_argument(
-        "path",
-        type=Path,
-        metavar="PATH",
-        help="acquisition: a recording; preprocessing: a view file or a recording; depth, normals: a dataset or a shard",
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="FILE", help="of the figure: .png, .pdf or .svg"
-    )
-    parser.add_argument("--scene", metavar="NAME", help="this scene (default: the first, or one a row)")
-    parser.add_argument(
-        "--view",
-        type=int,
-        metavar="N",
-        help="view N of a recording's scene or of a shard (default: the first)",
-    )
-    parser.add_argument("--rows", type=int, metavar="N", help="depth, normals: N scenes at most (default 4)")
-    parser.add_argument(
-        "--prediction",
-        type=Path,
-        metavar="DIR",
-        help="depth, normals: folder that predict wrote, or one with SCENE-000/ of each scene",
-    )
-    parser.add_argument(
-        "--rig", type=Path, metavar="FILE", help="preprocessing: rig.toml (default: the recording's)"
-    )
+    add = parser.add_argument
+    add("kind", choices=KINDS, metavar="KIND", help=", ".join(KINDS))
+    path = "acquisition: a recording; preprocessing: a view file or a recording; depth, normals: a dataset or a shard"
+    add("path", type=Path, metavar="PATH", help=path)
+    add("--out", type=Path, required=True, metavar="FILE", help="of the figure: .png, .pdf or .svg")
+    add("--scene", metavar="NAME", help="this scene (default: the first, or one a row)")
+    view = "view N of a recording's scene or of a shard (default: the first)"
+    add("--view", type=int, metavar="N", help=view)
+    add("--rows", type=int, metavar="N", help="depth, normals: N scenes at most (default 4)")
+    folder = "depth, normals: folder that predict wrote, or one with SCENE-000/ of each scene"
+    add("--prediction", type=Path, metavar="DIR", help=folder)
+    add("--rig", type=Path, metavar="FILE", help="preprocessing: rig.toml (default: the recording's)")
 
 
 def _figure(args: argparse.Namespace) -> Outcome:
@@ -116,19 +91,13 @@ def _figure(args: argparse.Namespace) -> Outcome:
 
 
 def _configure_stats(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that build-dataset filled")
-    parser.add_argument(
-        "--html",
-        type=Path,
-        nargs="?",
-        const=Path("stats.html"),
-        metavar="FILE",
-        help="write one self-contained page with pictures (default stats.html)",
-    )
+    add = parser.add_argument
+    add("dataset", type=Path, metavar="DATASET", help="folder that build-dataset filled")
+    page, text = Path("stats.html"), "write one self-contained page with pictures (default stats.html)"
+    add("--html", type=Path, nargs="?", const=page, metavar="FILE", help=text)
 
 
 def _stats(args: argparse.Namespace) -> Outcome:
-    from tofcapture.cli.kit import progress, table
     from tofcapture.dataset.stats import dataset_stats
     from tofcapture.viz.stats import TABLES, bit_rows, outlier_rows, quantity_rows, write_stats_page
 

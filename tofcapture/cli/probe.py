@@ -13,13 +13,15 @@ import subprocess
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
 from typing import Any
 
 from tofcapture.cli.kit import Command
 from tofcapture.errors import TofError
+
+_RTDE = ("rtde_control", "rtde_receive", "rtde_io", "dashboard_client")
 
 
 @dataclass(frozen=True)
@@ -32,92 +34,80 @@ class Finding:
     advice: str = ""
 
 
-def attempt(what: str, action: Callable[[], str], verdict: str = "FAIL", said: str = "") -> Finding:
+def graded(what: str, found: str, advice: str = "", bad: str = "WARN") -> Finding:
+    """Make a finding that is bad where there is advice."""
+    return Finding(what, bad if advice else "PASS", found, advice)
+
+
+def attempt(what: str, action: Callable[[], str], bad: str = "FAIL") -> Finding:
     """Do something that says what it found; an error becomes a finding in its own words."""
     try:
         return Finding(what, "PASS", action())
     except TofError as err:
-        return Finding(what, verdict, said + err.message, err.hint)
+        return Finding(what, bad, err.message, err.hint)
 
 
-def probe(name: str, *arguments: str, timeout: float = 60.0) -> list[Finding]:
-    """Look at something in a process of its own; one that hangs or crashes is a FAIL.
+def installed_version(name: str) -> str | None:
+    """Find the version of an installed package; ``None`` when it is not installed."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
 
-    Parameters
-    ----------
-    name, arguments
-        One of :data:`PROBES`, and what it takes.
-    timeout
-        Seconds until it is killed.
+
+def probe(name: str, *arguments: str, timeout: float = 0.0) -> list[Finding]:
+    """Make one of :data:`PROBES` in a process of its own; one that hangs or crashes is a FAIL.
+
+    It is killed after ``timeout`` seconds; 0: what it usually needs at most.
     """
+    # A UR arm's handshake may take seconds at each of its stages.
+    timeout = timeout or (60.0 if name != "station" else 180.0 if any(arguments[1:]) else 90.0)
     command = [sys.executable, "-m", "tofcapture.cli.probe", name, *arguments]
-    pipe = subprocess.PIPE
     try:
         done = subprocess.run(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=pipe,
-            stderr=pipe,
-            text=True,
-            timeout=timeout,
-            check=False,
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout, check=False
         )
+        return [Finding(**found) for found in json.loads(done.stdout)]
     except subprocess.TimeoutExpired:
         advice = "install it again; is this machine overloaded, or a device's network address dead?"
         return [Finding(name, "FAIL", f"no answer within {timeout:g} s", advice)]
-    try:
-        return [Finding(**found) for found in json.loads(done.stdout)]
     except (ValueError, TypeError):
-        said = _end(done.returncode, done.stderr)
-        return [Finding(name, "FAIL", said, f"{' '.join(command)} shows more")]
+        return [Finding(name, "FAIL", _end(done), f"{' '.join(command)} shows more")]
 
 
-def _end(code: int, stderr: str) -> str:
-    """How a probe ended that said nothing."""
-    if code < 0:
-        return f"crashed with {signal.Signals(-code).name if -code in set(signal.Signals) else f'signal {-code}'}"
-    last = next((line for line in reversed(stderr.splitlines()) if line.strip()), "")
-    return f"ended with {code}: {last}"
+def _end(done: subprocess.CompletedProcess[str]) -> str:
+    """Say how a probe ended that said nothing."""
+    signals = {-number: number.name for number in signal.Signals}
+    if done.returncode < 0:
+        return f"crashed with {signals.get(done.returncode, f'signal {-done.returncode}')}"
+    last = next((line for line in reversed(done.stderr.splitlines()) if line.strip()), "")
+    return f"ended with {done.returncode}: {last}"
 
 
-def _version(*names: str) -> str | None:
-    for name in names:
-        try:
-            return version(name)
-        except PackageNotFoundError:
-            continue
-    return None
-
-
-def _import(name: str, modules: tuple[str, ...], advice: str) -> Finding:
+def _import(name: str, modules: tuple[str, ...], cameras: str) -> Finding:
     """Import modules; missing is a warning, broken a failure."""
-    if (found := _version(name)) is None:
-        return Finding(name, "WARN", "not installed", advice)
+    advice = f"pip install 'tofcapture[hardware]', for {cameras}"
+    if (found := installed_version(name)) is None:
+        return graded(name, "not installed", advice)
     try:
         for module in modules:
             importlib.import_module(module)
     except Exception as err:
-        return Finding(name, "FAIL", f"{found}, does not load: {type(err).__name__}: {err}", advice)
-    return Finding(name, "PASS", f"{found}, loads")
+        return graded(name, f"{found}, does not load: {type(err).__name__}: {err}", advice, "FAIL")
+    return graded(name, f"{found}, loads")
 
 
 def probe_open3d() -> Iterator[Finding]:
     """Load open3d; a missing libusb is its usual trouble."""
     from tofcapture.libraries import load_open3d
 
-    verdict = "FAIL" if _version("open3d", "open3d-cpu") else "WARN"
-    yield attempt("open3d", lambda: f"{load_open3d().__version__}, loads", verdict)
-
-
-def probe_ur_rtde() -> Iterator[Finding]:
-    """Load the Universal Robots client."""
-    modules = ("rtde_control", "rtde_receive", "rtde_io", "dashboard_client")
-    yield _import("ur-rtde", modules, "pip install 'tofcapture[hardware]', for arms of Universal Robots")
+    there = installed_version("open3d") or installed_version("open3d-cpu")
+    yield attempt("open3d", lambda: f"{load_open3d().__version__}, loads", "FAIL" if there else "WARN")
 
 
 def probe_nxlib() -> Iterator[Finding]:
     """Load the Ensenso client, and the SDK behind it."""
-    found = _import("nxlib", ("nxlib",), "pip install 'tofcapture[hardware]', for Ensenso cameras")
+    found = _import("nxlib", ("nxlib",), "Ensenso cameras")
     yield found
     if found.verdict == "PASS":
         yield attempt("Ensenso SDK", _load_ensenso, "WARN")
@@ -137,12 +127,11 @@ def probe_drivers() -> Iterator[Finding]:
     drivers = found_drivers()
     for name, entry in drivers.items():
         try:
-            yield Finding(f"driver {name}", "PASS", ", ".join(sorted(load_driver(name))))
+            yield graded(f"driver {name}", ", ".join(sorted(load_driver(name))))
         except TofError as err:
-            advice = f"repair or uninstall what provides {entry.value}"
-            yield Finding(f"driver {name}", "WARN", err.message, advice)
+            yield graded(f"driver {name}", err.message, f"repair or uninstall what provides {entry.value}")
     if not drivers:
-        yield Finding("drivers", "FAIL", "none is installed", "install the package: pip install tofcapture")
+        yield graded("drivers", "none is installed", "install the package: pip install tofcapture", "FAIL")
 
 
 def probe_commands() -> Iterator[Finding]:
@@ -158,9 +147,9 @@ def probe_commands() -> Iterator[Finding]:
             whole = False
             found = broken or f"{names.count(entry.name)} packages provide it"
             advice = f"install again, or uninstall, what provides {entry.value}"
-            yield Finding(f"command {entry.name}", "FAIL" if broken else "WARN", found, advice)
+            yield graded(f"command {entry.name}", found, advice, "FAIL" if broken else "WARN")
     if whole:
-        yield Finding("commands", "PASS", f"{len(names)}, all import")
+        yield graded("commands", f"{len(names)}, all import")
 
 
 def probe_station(path: str, opening: str = "") -> Iterator[Finding]:
@@ -170,26 +159,25 @@ def probe_station(path: str, opening: str = "") -> Iterator[Finding]:
     from tofcapture.devices.station import open_station, read_station
 
     file = Path(path) if path else None
-    context = StationContext(config={}, folder=(file or Path()).resolve().parent)
-
-    def read() -> str:
-        nonlocal context
-        context = replace(context, config=read_station(file))
-        stage_of(context.config)
-        return f"{path or 'the simulated one'} is read"
+    try:
+        config = read_station(file)
+        stage_of(config)
+    except TofError as err:
+        yield Finding("station", "FAIL", err.message, err.hint)
+        return
+    yield graded("station", f"{path or 'the simulated one'} is read")
+    context = StationContext(config=config, folder=(file or Path()).resolve().parent)
+    found = [finding for role in ROLES for finding in _probe_device(role, context)]
+    found += _probe_rig(context)
+    yield from found
 
     def open_all() -> str:
         with open_station(file) as station:
             joints = ", ".join(f"{q:.2f}" for q in station.arm.state().joints)
             return f"all open; the arm stands at {joints} rad"
 
-    found = [attempt("station", read)]
-    if found[0].verdict == "PASS":
-        found += [finding for role in ROLES for finding in _probe_device(role, context)]
-        found += _probe_rig(context)
     if opening and all(f.verdict != "FAIL" for f in found):
-        found.append(attempt("devices", open_all))
-    yield from found
+        yield attempt("devices", open_all)
 
 
 def _probe_device(role: str, context: Any) -> Iterator[Finding]:
@@ -201,20 +189,21 @@ def _probe_device(role: str, context: Any) -> Iterator[Finding]:
     except TofError as err:
         yield Finding(role, "FAIL", err.message, err.hint)
         return
-    said = f"driver {context.config[role]['driver']}"
-    described = True
+    said, warned = f"driver {context.config[role]['driver']}", False
     if role != "operator":
         try:
             info = device.describe()
             said = f"{said}: {info.model} {info.serial}".rstrip()
         except TofError as err:
-            described = False
+            warned = True
             yield Finding(role, "WARN", err.message, err.hint)
-    found = attempt(role, device.probe, said=f"{said}: ")
-    if found.verdict == "PASS":
-        found = replace(found, found=f"{said}; {found.found}" if found.found else said)
-    if found.verdict != "PASS" or described or found.found != said:
-        yield found
+    try:
+        there = device.probe()
+    except TofError as err:
+        yield Finding(role, "FAIL", f"{said}: {err.message}", err.hint)
+        return
+    if there or not warned:
+        yield graded(role, f"{said}; {there}" if there else said)
 
 
 def _probe_rig(context: Any) -> Iterator[Finding]:
@@ -225,12 +214,12 @@ def _probe_rig(context: Any) -> Iterator[Finding]:
         yield attempt("rig", lambda: str(load_rig(context.folder / str(path)) and path))
     elif "rig" not in context.shared:
         advice = 'add [rig] path = "rig.toml", the bracket\'s drawing for a start; see docs/formats.md'
-        yield Finding("rig", "FAIL", "the station names none", advice)
+        yield graded("rig", "the station names none", advice, "FAIL")
 
 
 PROBES: dict[str, Callable[..., Iterator[Finding]]] = {
     "open3d": probe_open3d,
-    "ur-rtde": probe_ur_rtde,
+    "ur-rtde": lambda: iter([_import("ur-rtde", _RTDE, "arms of Universal Robots")]),
     "nxlib": probe_nxlib,
     "drivers": probe_drivers,
     "commands": probe_commands,

@@ -57,10 +57,7 @@ def bundled_path() -> Path | None:
 def describe_weights(path: Path) -> BundledWeights:
     """Read the header of a checkpoint (safetensors: eight bytes of length, then JSON).
 
-    Raises
-    ------
-    FormatError
-        It is none, or is cut short.
+    Raises :class:`FormatError`: it is none, or is cut short.
     """
     try:
         with path.open("rb") as file:

@@ -17,9 +17,8 @@ _FULL = 100  # scenes that figures are extrapolated to
 def _configure_view(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("world", type=Path, metavar="WORLD.toml", help="the world: meshes, albedos, cameras")
-    add(
-        "--out", type=Path, required=True, metavar="VIEW.h5", help="view file to write; replaced if it exists"
-    )
+    file = "view file to write; replaced if it exists"
+    add("--out", type=Path, required=True, metavar="VIEW.h5", help=file)
     text = "no sensor imperfection, no quantisation; geometry, albedo and multipath stay"
     add("--ideal", action="store_true", help=text)
     add("--frames", type=int, default=None, help="frames in the burst (default 10, ideal 1)")
@@ -51,13 +50,8 @@ def _run_view(args: argparse.Namespace) -> Outcome:
 
 def _configure_dataset(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="the dataset's folder; completed when it exists",
-    )
+    folder = "the dataset's folder; completed when it exists"
+    add("--out", type=Path, required=True, metavar="DIR", help=folder)
     add("--suite", default="tof100", metavar="NAME", help="tof100 (default), indoor, multipath or noise")
     for name, default, text in (
         ("--scenes", None, "scenes to simulate"),

@@ -63,20 +63,14 @@ def record(
 
     Parameters
     ----------
-    station
-        Open devices.
-    scene
-        Name; ``calibration`` for views of the board.
-    recording
-        Folder; made when missing.
-    views, frames
-        Views of the scene, ToF frames of each burst.
+    station, scene, recording
+        Open devices; a name, ``calibration`` for views of the board; a folder, made when missing.
+    views, frames, turns
+        Views of the scene, ToF frames of each burst, ways in which the operator is asked to put the object.
     progress
         Called with (views there, views planned) before the first and after each view.
     observer
         Looks on; may make the recorder wait between views, or end it.
-    turns
-        In how many ways the operator is asked to put the object on the table.
 
     Raises
     ------
@@ -154,10 +148,7 @@ class _Run:
     def take(self, planned: PlannedView) -> None:
         """Move, expose, check and seal, in three attempts at most; else give the view up.
 
-        Raises
-        ------
-        DeviceError
-            This view and the one before it failed.
+        Raises :class:`DeviceError`: this view and the one before it failed.
         """
         for attempt in range(1, ATTEMPTS + 1):
             self.journal.attempt(self.scene, planned.index)
@@ -250,13 +241,7 @@ class _Run:
 
     def result(self, kept: set[int], repaired: list[str]) -> RecordResult:
         """Sum up."""
-        return RecordResult(
-            scene=self.scene,
-            recorded=tuple(sorted(self.recorded)),
-            kept=tuple(sorted(kept)),
-            failed=tuple(sorted(self.reasons)),
-            reasons=tuple(f"view {i}: {self.reasons[i]}" for i in sorted(self.reasons)),
-            repaired=tuple(repaired),
-            plan=self.plan,
-            notes=tuple(self.notes),
-        )
+        recorded, there, failed = (tuple(sorted(n)) for n in (self.recorded, kept, self.reasons))
+        reasons = tuple(f"view {i}: {self.reasons[i]}" for i in failed)
+        notes = tuple(self.notes)
+        return RecordResult(self.scene, recorded, there, failed, reasons, tuple(repaired), self.plan, notes)

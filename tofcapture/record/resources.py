@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from tofcapture.errors import BusyError, ConfigError, MotionRefused
 
@@ -72,11 +72,8 @@ def hold_file(path: Path, what: str, hint: str) -> Iterator[None]:
     Raises :class:`BusyError`: another process holds it: ``what``, its id, ``hint``.
     """
     with path.open("a+", encoding="ascii") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as err:
-            file.seek(0)
-            raise BusyError(f"{what} (process {file.read().strip() or 'unknown'})", hint=hint) from err
+        file.seek(0)
+        _lock(file, f"{what} (process {file.read().strip() or 'unknown'})", hint)
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
@@ -99,14 +96,16 @@ def hold_arm(arm: Arm) -> Iterator[None]:
         handle = os.open(path, os.O_RDONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
     except PermissionError:  # another user's file in a sticky folder can be locked, but not created
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    with os.fdopen(handle):
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as err:
-            raise BusyError(
-                f"the arm {info.model} {info.serial} is moved by another process", hint="tofcapture status"
-            ) from err
+    with os.fdopen(handle) as file:
+        _lock(file, f"the arm {info.model} {info.serial} is moved by another process", "tofcapture status")
         yield
+
+
+def _lock(file: TextIO, busy: str, hint: str) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as err:
+        raise BusyError(busy, hint=hint) from err
 
 
 def check_motion_allowed(station: Station, allowed: bool, hint: str) -> None:

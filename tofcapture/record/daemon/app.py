@@ -17,9 +17,9 @@ from aiohttp import web
 from tofcapture import __version__
 from tofcapture.errors import UsageError
 from tofcapture.record.daemon.guard import BODY_LIMIT, Guard, Handler, body_of
+from tofcapture.record.daemon.settings import PICTURES
 from tofcapture.record.daemon.store import Streams
 from tofcapture.record.daemon.supervisor import Supervisor
-from tofcapture.record.daemon.worker import NAMES
 
 PAGE = Path(__file__).with_name("page")
 PAGE_FILES = {
@@ -222,7 +222,7 @@ class Api:
     def preview(self, name: str) -> web.Response:
         """The latest picture."""
         path = self._do.settings.state.previews / f"{name}.png"
-        if name not in NAMES or not path.exists():
+        if name not in PICTURES or not path.exists():
             raise web.HTTPNotFound(reason="there is no such picture yet")
         return web.Response(body=path.read_bytes(), content_type="image/png")
 

@@ -32,12 +32,7 @@ def ask(
 ) -> dict[str, Any]:
     """Ask the daemon whose folder is ``state`` (default: the user's): ``ask("POST", "/v1/jobs", {"scene": ...})``.
 
-    Raises
-    ------
-    DeviceError
-        No daemon answers.
-    UsageError, BusyError, DataError, TofError
-        It refuses, in its words.
+    Raises :class:`DeviceError`: no daemon answers; :class:`TofError` of other kinds: it refuses, in its words.
     """
     folder = state_folder(state)
     link = _UnixConnection(folder.socket)
@@ -62,14 +57,7 @@ def ask(
 def hand_over(recording: Path, job: Mapping[str, Any], state: Path | None = None) -> dict[str, Any] | None:
     """Queue a scene (``scene``, ``views``, ``frames``, perhaps ``seed``) with the daemon that keeps a recording.
 
-    Returns
-    -------
-    The job; ``None`` when no daemon runs, or its recordings lie elsewhere.
-
-    Raises
-    ------
-    UsageError, BusyError
-        The daemon refuses.
+    Returns the job; ``None`` when no daemon runs, or its recordings lie elsewhere. Raises what :func:`ask` raises.
     """
     try:
         root = Path(ask("GET", "/v1/state", state=state)["root"])

@@ -27,7 +27,6 @@ IDLE = 30.0  # s that a connection may take to send a request, or to take an ans
 _BODY = 5.0  # s for a body
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-Connection = RequestHandler
 
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -56,8 +55,8 @@ class Guard:
     def __init__(self, token: str, open_paths: frozenset[str]) -> None:
         self._token, self._open_paths = token, open_paths
         self._hosts: frozenset[str] = frozenset()
-        self._busy: set[Connection] = set()
-        self._waiting: dict[Connection, float] = {}  # since when
+        self._busy: set[RequestHandler] = set()
+        self._waiting: dict[RequestHandler, float] = {}  # since when
         self.codes: dict[int, int] = {}
 
     def serve_tcp(self, port: int) -> None:
@@ -150,12 +149,7 @@ async def _handle(request: web.Request, handler: Handler) -> web.StreamResponse:
 async def body_of(request: web.Request) -> Any:
     """Read the body as strict JSON.
 
-    Raises
-    ------
-    web.HTTPException
-        400 when it is none, 413 when it is too large.
-    TimeoutError
-        It came too slowly.
+    Raises :class:`web.HTTPException`: 400, it is none, or 413, it is too large; :class:`TimeoutError`: it came too slowly.
     """
     async with asyncio.timeout(_BODY):
         data = await request.read()

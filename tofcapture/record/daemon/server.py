@@ -50,11 +50,7 @@ def serve(settings: Settings, http: Address | None, announce: Callable[[str | No
     """Run until SIGTERM or SIGINT; listen on a loopback address too, where port 0 takes a free one.
 
     ``announce`` is called when everything listens, with the page's address, token included, or ``None`` without TCP.
-
-    Raises
-    ------
-    BusyError
-        Another daemon runs in this folder, or the port is taken.
+    Raises :class:`BusyError`: another daemon runs in this folder, or the port is taken.
     """
     if not settings.root.is_dir():
         raise ConfigError(f"{settings.root}: expected a folder for recordings", hint="make it first")

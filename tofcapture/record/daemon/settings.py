@@ -13,6 +13,7 @@ from pathlib import Path
 from tofcapture.errors import ConfigError
 from tofcapture.record.resources import hold_file
 
+PICTURES = ("amplitude", "depth", "stereo")  # of the latest view
 _SOCKET_LIMIT = 107  # bytes of a Unix socket's path that Linux takes
 
 

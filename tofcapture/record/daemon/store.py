@@ -75,12 +75,7 @@ class Event:
 class Store:
     """The open database; one transaction per call.
 
-    Raises
-    ------
-    DataError
-        The file is no such database.
-    DiskFull
-        By every method that writes.
+    Raises :class:`DataError`: the file is no such database; :class:`DiskFull`: by every method that writes.
     """
 
     def __init__(self, path: Path) -> None:

@@ -47,7 +47,7 @@ class RecorderProcess:
                 *settings.worker, stdin=pipe, stdout=pipe, start_new_session=True, limit=_LINE, env=env
             )
         )
-        started._send(job)
+        started.send(job)
         return started
 
     @property
@@ -55,11 +55,8 @@ class RecorderProcess:
         """Seconds since the last message."""
         return time.monotonic() - self._heard
 
-    def order(self, verb: str) -> None:
-        """Give an order; one that has ended already hears nothing, which is right."""
-        self._send({"do": verb})
-
-    def _send(self, message: Mapping[str, Any]) -> None:
+    def send(self, message: Mapping[str, Any]) -> None:
+        """Send the job, or an order; one that has ended already hears nothing, which is right."""
         pipe = self._process.stdin
         if pipe is not None and not pipe.is_closing():
             with contextlib.suppress(OSError):
@@ -221,7 +218,7 @@ class Supervisor:
 
     def _order(self, verb: str) -> None:
         if self._recorder:
-            self._recorder.order(verb)
+            self._recorder.send({"do": verb})
 
     async def run(self) -> None:
         """Work until closed."""
@@ -235,9 +232,8 @@ class Supervisor:
                     continue
                 try:
                     await self._work_on(job)
-                except (
-                    DiskFull
-                ) as err:  # too full to note the job's end: it stays as it is, for when there is room
+                except DiskFull as err:
+                    # Too full to note the job's end: it stays as it is, for when there is room.
                     self.reason = f"{err.message}: {err.hint}"
                     self._rest()
             health.cancel()
@@ -247,7 +243,7 @@ class Supervisor:
         self._closing = True
         self._wake.set()
         if self._recorder:
-            self._recorder.order("stop")
+            self._order("stop")
             await self._recorder.end()
 
     def _rest(self) -> None:

@@ -17,25 +17,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.colours import Kind, png_bytes, scale_for
 from tofcapture.devices import Operator
 from tofcapture.errors import BusyError, DeviceError, TofError
+from tofcapture.files.seal import replacing
+from tofcapture.frames import View
+from tofcapture.ops.phase import Decoder
+from tofcapture.record.daemon.settings import PICTURES
 from tofcapture.record.observer import Observer, Stopped
 from tofcapture.record.resources import DiskFull, check_motion_allowed
 
 if TYPE_CHECKING:
     from tofcapture.devices.station import Station
-    from tofcapture.frames import View
     from tofcapture.record.plan import Plan
-import numpy as np
-from numpy.typing import NDArray
 
-from tofcapture.colours import Kind, png_bytes, scale_for
-from tofcapture.files.seal import replacing
-from tofcapture.frames import View
-from tofcapture.ops.phase import Decoder
-from tofcapture.record.quality import measure
-
-NAMES = ("amplitude", "depth", "stereo")
+ALIVE = 0.5  # s between signs of life
+_LAST_WORDS = 2.0  # s that the recorder has to notice that it shall end
+_PATIENCE = 1800.0  # s that an operator may take to place a scene
 _WIDE = 320  # px; larger pictures are thinned out
 
 
@@ -47,40 +48,25 @@ def picture(kind: Kind, image: NDArray[Any]) -> bytes:
     return png_bytes(scale.paint(small), level=1)
 
 
-def pictures(view: View) -> dict[str, bytes]:
-    """PNG of amplitude and depth of the ToF camera, and of the stereo camera's depth, by name."""
+def save(view: View, folder: Path) -> None:
+    """Write the pictures of a view; a reader sees the old or the new one, never half of one."""
     decoded = Decoder(view.tof.info).burst(view.tof.raw, float(np.mean(view.tof.celsius)))
-    return {
-        "amplitude": picture("amplitude", decoded.confidence),
-        "depth": picture("depth", decoded.depth),
-        "stereo": picture("depth", view.stereo.points[..., 2]),
-    }
+    images = (decoded.confidence, decoded.depth, view.stereo.points[..., 2])
+    kinds: tuple[Kind, ...] = ("amplitude", "depth", "depth")
+    for name, kind, image in zip(PICTURES, kinds, images, strict=True):
+        with replacing(folder / f"{name}.png") as partial:
+            partial.write_bytes(picture(kind, image))
 
 
 def quality(view: View) -> dict[str, Any]:
-    """Numbers about a view: those of ``record.quality``, its notes in sentences, frames, degrees Celsius."""
-    found: Any = view.provenance.get("quality")
-    if found is None:
-        found = measure(view.tof, view.stereo, view.arm_before, view.arm_after, view.rig, len(view.tof.raw))
+    """Tell the recorder's numbers about a view (``record.quality``), its notes in sentences, frames, degrees Celsius."""
+    found: dict[str, Any] = {**view.provenance["quality"]}
     celsius = float(np.mean(view.tof.celsius))
-    return {
-        **{name: value for name, value in found.items() if name != "notes"},
-        "notes": [note["words"] for note in found.get("notes", ())],
+    found["notes"] = [note["words"] for note in found["notes"]]
+    return found | {
         "frames": len(view.tof.time_ns),
         "celsius": round(celsius, 1) if np.isfinite(celsius) else None,
     }
-
-
-def save(view: View, folder: Path) -> None:
-    """Write the pictures of a view; a reader sees the old or the new one, never half of one."""
-    for name, data in pictures(view).items():
-        with replacing(folder / f"{name}.png") as partial:
-            partial.write_bytes(data)
-
-
-ALIVE = 0.5  # s between signs of life
-_LAST_WORDS = 2.0  # s that the recorder has to notice that it shall end
-_PATIENCE = 1800.0  # s that an operator may take to place a scene
 
 
 class DaemonLink(Observer):
@@ -125,10 +111,7 @@ class DaemonLink(Observer):
             raise Stopped("stopped by the operator", hint="ask for the same scene again to go on")
 
     def ask(self, scene: str) -> None:
-        """Wait until a person says that the scene is placed.
-
-        Raises :class:`DeviceError`: nobody answers: the arm stays where it is.
-        """
+        """Wait until a person says that the scene is placed. Raises :class:`DeviceError`: nobody answers."""
         self.confirmed = False
         self.tell("ask", scene=scene)
         with self._changed:
@@ -205,7 +188,7 @@ class PageOperator(Operator):
 
 def _work(job: Mapping[str, Any], link: DaemonLink) -> dict[str, Any]:
     """Open the station, record, and say what came of it."""
-    # Imported late: orders are followed, and signs of life given, while the libraries load.
+    # Imported late: orders are followed, and signs of life given, while the station's libraries load.
     from tofcapture.devices.station import open_station
     from tofcapture.record.recorder import record
 
