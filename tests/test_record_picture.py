@@ -10,9 +10,8 @@ import pytest
 from tests.test_plan import RIG, STAGE, UR10E
 from tofcapture.cli import main
 from tofcapture.errors import BusyError, DeviceError
-from tofcapture.record.candidates import REFUSALS, REMEDIES, object_sampling
 from tofcapture.record.daemon import client
-from tofcapture.record.plan import plan_views
+from tofcapture.record.plan import REFUSALS, REMEDIES, object_sampling, plan_views
 from tofcapture.viz.plan import write_plan
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -252,11 +252,6 @@ def emulator():
         yield running
 
 
-@pytest.fixture
-def quick(monkeypatch):
-    monkeypatch.setattr(probing, "_TIMEOUT", 0.4)
-
-
 def _ask(emulator, **more):
     return probing.probe(read_settings({"host": emulator.host, **more}))
 
@@ -276,16 +271,17 @@ def _ask_on(emulator):
 
 
 @pytest.mark.parametrize("stage", [s for s in STAGES if s not in {"I", "script", "ready", "done"}])
-def test_probe_names_the_silent_stage(emulator, quick, stage):
+def test_probe_names_the_silent_stage(emulator, monkeypatch, stage):
     """A controller that falls silent anywhere in the handshake is named silent within the timeout."""
     emulator.order("lift")
     emulator.order("mute", stage=stage)
+    monkeypatch.setattr(probing, "_TIMEOUT", 0.4)
     with pytest.raises(faults.ControllerSilent, match="silent at"):
         _ask(emulator)
     emulator.order("lift")
 
 
-def test_probe_refuses_what_is_not_ready(emulator, quick):
+def test_probe_refuses_what_is_not_ready(emulator):
     """Local control, another arm, another payload, stops, and nobody there are told apart."""
     emulator.order("lift")
     emulator.order("remote", on=False)

@@ -81,13 +81,11 @@ def _export(args: argparse.Namespace) -> Outcome:
 
     start = time.monotonic()
     with progress() as report:
-        result = export(
-            args.path,
-            args.kind,
-            args.out,
-            unit=args.unit,
-            progress=lambda scene, done, total: report("export", done, total, scene),
-        )
+
+        def tell(scene: str, done: int, total: int) -> None:
+            report("export", done, total, scene)
+
+        result = export(args.path, args.kind, args.out, unit=args.unit, progress=tell)
     seconds = round(time.monotonic() - start, 2)
     data = {
         "out": str(args.out),

@@ -125,19 +125,15 @@ def _row(method: dict[str, Any]) -> dict[str, float]:
     return {**row, "normal_mean_deg": method["normal"]["pixel"]["mean_deg"]}
 
 
-_COLUMNS = {
-    "mae_mm": "MAE mm",
-    "rmse_mm": "RMSE mm",
-    "median_mm": "median mm",
-    "normal_mean_deg": "normal deg",
-}
+_NUMBERS = ("mae_mm", "rmse_mm", "median_mm", "normal_mean_deg")
+_COLUMNS = ("", "MAE mm", "RMSE mm", "median mm", "normal deg")
 _NAMES = {"bundled": "bundled network", "trained": "small network"}
 
 
 def _text(data: Mapping[str, Any], out: Path) -> str:
     names = {"sensor": "ToF sensor", "model": _NAMES[data["network"]]}
     rows = [
-        [f"{scenes}: {name}", *(f"{methods[key][column]:.2f}" for column in _COLUMNS)]
+        [f"{scenes}: {name}", *(f"{methods[key][column]:.2f}" for column in _NUMBERS)]
         for scenes, methods in data["scenes"].items()
         for key, name in names.items()
     ]
@@ -147,7 +143,7 @@ alignment: {align["rotation_error_deg"]:.3f} deg, {align["translation_error_mm"]
 ground truth with the true rig: median {truth["median_error_mm"]:.2f} mm, 99 % within {truth["p99_error_mm"]:.2f} mm
 ground truth with the rig as aligned: median {built["median_error_mm"]:.2f} mm
 
-{table(["", *_COLUMNS.values()], rows, "  ")}
+{table(_COLUMNS, rows, "  ")}
 
 report: {data["report"]}   ({data["seconds"]["total"] / 60:.1f} minutes in all)
 points: {data["prediction"]}/cloud.ply   depth, normals and pictures beside it

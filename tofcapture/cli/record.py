@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,17 +64,10 @@ def _run(args: argparse.Namespace) -> Outcome:
             return _planned(args, scene, station, plan_scene(station, scene, views, args.turns))
         hint = "look at --dry-run, clear the workspace, then add --allow-motion"
         check_motion_allowed(station, args.allow_motion, hint)
+        meter = _BoardMeter(station) if args.calibration else None
         with progress() as report:
-            result = record(
-                station,
-                scene,
-                args.out,
-                views,
-                args.frames,
-                lambda done, total: report(f"record {scene}", done, total),
-                _BoardMeter(station) if args.calibration else None,
-                args.turns,
-            )
+            tell = partial(report, f"record {scene}")
+            result = record(station, scene, args.out, views, args.frames, tell, meter, args.turns)
     return _recorded(args.out, result)
 
 

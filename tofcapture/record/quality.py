@@ -211,13 +211,9 @@ def meter(poses: Sequence[Float64], board: Float64, normal: Float64, camera: Cam
     counts = np.histogram(tilt, TILTS)[0]
     tilts = [f"{a:g}-{b:g} deg {n}" for a, b, n in zip(TILTS[:-1], TILTS[1:], counts, strict=True)]
     share = np.any([_seen(pose, board, normal, camera) for pose in poses], axis=0).mean()
-    return "\n".join(
-        [
-            f"{len(poses)} board views, {distance.min():.2f} to {distance.max():.2f} m, image {100 * share:.0f} % covered",
-            f"  tilts  {'  '.join(tilts)}",
-            f"  faces  {'  '.join(faces)}",
-        ]
-    )
+    far = f"{distance.min():.2f} to {distance.max():.2f} m"
+    title = f"{len(poses)} board views, {far}, image {100 * share:.0f} % covered"
+    return f"{title}\n  tilts  {'  '.join(tilts)}\n  faces  {'  '.join(faces)}"
 
 
 def _seen(T_base_tof: Float64, board: Float64, normal: Float64, camera: Camera) -> Float64:

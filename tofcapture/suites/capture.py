@@ -25,8 +25,7 @@ from tofcapture.files.seal import sealed_digest
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, View
 from tofcapture.poses import invert
-from tofcapture.record.candidates import object_sampling
-from tofcapture.record.plan import plan_views
+from tofcapture.record.plan import object_sampling, plan_views
 from tofcapture.suites.scene import Scene
 
 

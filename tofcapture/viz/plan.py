@@ -11,8 +11,7 @@ import numpy as np
 from tofcapture.devices.clearance import Stage
 from tofcapture.files.seal import write_text
 from tofcapture.poses import Float64, transform_points
-from tofcapture.record.candidates import REMEDIES
-from tofcapture.record.plan import Plan, PlannedView
+from tofcapture.record.plan import REMEDIES, Plan, PlannedView
 from tofcapture.rig import Rig
 from tofcapture.viz.page import LINES, canvas, frustum, svg_text
 

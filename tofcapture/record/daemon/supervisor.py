@@ -42,11 +42,10 @@ class RecorderProcess:
         pipe = asyncio.subprocess.PIPE
         # Numerical libraries that spin on every core would take them from the daemon.
         env = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
-        started = cls(
-            await asyncio.create_subprocess_exec(
-                *settings.worker, stdin=pipe, stdout=pipe, start_new_session=True, limit=_LINE, env=env
-            )
+        process = await asyncio.create_subprocess_exec(
+            *settings.worker, stdin=pipe, stdout=pipe, start_new_session=True, limit=_LINE, env=env
         )
+        started = cls(process)
         started.send(job)
         return started
 
