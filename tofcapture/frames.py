@@ -1,4 +1,4 @@
-"""What devices hand over, and a view: everything captured at one pose of one scene."""
+"""Define what devices hand over, and a view: everything captured at one pose of one scene."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ TOF_FLAG_DOCS = {
 
 @dataclass(frozen=True)
 class TofInfo:
-    """What a ToF driver says of its camera without opening it."""
+    """Hold what a ToF driver says of its camera without opening it."""
 
     model: str
     serial: str
@@ -72,7 +72,7 @@ class TofBurst:
 
 @dataclass(frozen=True)
 class StereoInfo:
-    """What a stereo driver says of its camera: model, serial, intrinsics of the point map's grid."""
+    """Hold what a stereo driver says of its camera: model, serial, intrinsics of the point map's grid."""
 
     model: str
     serial: str
@@ -98,7 +98,7 @@ class StereoFrame:
 
 @dataclass(frozen=True)
 class ArmInfo:
-    """What an arm driver says of its arm: model (``ur10e`` ...) and serial."""
+    """Hold what an arm driver says of its arm: model (``ur10e`` ...) and serial."""
 
     model: str
     serial: str
@@ -106,7 +106,7 @@ class ArmInfo:
 
 @dataclass(frozen=True)
 class ArmState:
-    """Where the arm says it is."""
+    """Tell where the arm says it is."""
 
     joints: Float64  #: (6,) measured joint angles, radians.
     T_base_flange: Float64  #: (4, 4), from the measured joints.
@@ -118,7 +118,7 @@ class ArmState:
 
 @dataclass(frozen=True)
 class Truth:
-    """What only a simulator knows of a view."""
+    """Hold what only a simulator knows of a view."""
 
     #: (2H, 2W) float32, exact depth at the pixel centres of the ToF plane at twice its resolution, metres;
     #: NaN for rays that hit nothing.

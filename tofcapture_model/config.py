@@ -111,7 +111,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Training:
-    """How to train."""
+    """Tell how to train."""
 
     batch: int = 4  #: frames per step and process
     crop: tuple[int, ...] = ()  #: (height, width) at sensor resolution; () takes whole frames

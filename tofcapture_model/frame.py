@@ -1,4 +1,4 @@
-"""What a network reads, what it is held against, and what it answers: batches of frames, targets and estimates."""
+"""Define what a network reads, what it is held against, and what it answers: batches of frames, targets and estimates."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Target(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """What a model answers, float32 at twice the resolution, after and before refinement."""
+    """Hold what a model answers, float32 at twice the resolution, after and before refinement."""
 
     depth: Tensor  #: (B, 1, 2H, 2W) m
     normals: Tensor  #: (B, 3, 2H, 2W) unit, facing the camera

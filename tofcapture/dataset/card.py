@@ -130,7 +130,7 @@ def _good_share(dataset: Path, manifest: Manifest, pixels: int) -> str:
 
 
 def _of_first(dataset: Path, manifest: Manifest) -> dict[str, Any]:
-    """What one shard tells of all: sensors, sizes, whether it was simulated."""
+    """Tell what one shard tells of all: sensors, sizes, whether it was simulated."""
     entry = manifest.scenes[min(manifest.scenes)]
     with ShardReader(dataset / entry.path, entry.sha256) as shard:
         (H, W), (SH, SW) = shard.camera.shape, shard.rig.stereo.shape

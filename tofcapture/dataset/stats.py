@@ -26,7 +26,7 @@ _PER_MAD = 1.4826  # standard deviations of a normal distribution per median abs
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is counted: name, unit, the histogram's range, and whether its bins grow by a constant factor.
+    """Hold what is counted: name, unit, the histogram's range, and whether its bins grow by a constant factor.
 
     ``floor`` is the least deviation of views that counts, so that where all are but equal no hair stands out.
     """

@@ -45,7 +45,7 @@ class Station:
 
     @property
     def world(self) -> dict[str, Any]:
-        """What a simulated world is made of; faults on demand come and go without making it another."""
+        """Tell what a simulated world is made of; faults on demand come and go without making it another."""
         return {key: value for key, value in self.config.get("sim", {}).items() if key != "faults"}
 
     @property

@@ -140,7 +140,7 @@ def _descriptions(file: h5py.File, path: Path, layout: Layout) -> tuple[dict[str
 
 
 def _sizes(file: h5py.File, info: TofInfo, stereo: StereoInfo) -> dict[str, int]:
-    """What the dims' letters mean here: from the descriptions; views and frames from the raw array itself."""
+    """Tell what the dims' letters mean here: from the descriptions; views and frames from the raw array itself."""
     raw = file.get("tof/raw")
     shape: tuple[int, ...] = raw.shape if isinstance(raw, h5py.Dataset) else ()
     (H, W), (SH, SW) = info.camera.shape, stereo.camera.shape

@@ -39,7 +39,7 @@ PARALLEL = 0.05  # share of the points that makes a parallel plane below
 
 @dataclass(frozen=True)
 class Crop:
-    """Where the scene's object is, ToF frame."""
+    """Tell where the scene's object is, ToF frame."""
 
     normal: Float64  #: (3,) of the table ``normal . p = offset``, unit, towards the camera; NaN: no table.
     offset: float  #: Metres.

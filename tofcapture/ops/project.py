@@ -45,7 +45,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Projection:
-    """What the ToF camera's rays meet."""
+    """Hold what the ToF camera's rays meet."""
 
     depth: Float64  #: (H, W) metres; NaN: no surface, as for pixels and normals.
     pixels: Float64  #: (H, W, 2) (u, v) on the stereo grid of the point that is met.

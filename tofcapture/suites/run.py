@@ -26,7 +26,7 @@ _CAPTURE = 0.7  # share of a view's work that is done when it is captured; the r
 
 @dataclass(frozen=True)
 class Simulated:
-    """What a run did."""
+    """Hold what a run did."""
 
     dataset: Path
     made: tuple[Made, ...]  #: Scenes of this run.

@@ -1,4 +1,4 @@
-"""What a suite is: its recipe, and the scenes that come of it."""
+"""Define what a suite is: its recipe, and the scenes that come of it."""
 
 from __future__ import annotations
 

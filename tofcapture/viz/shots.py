@@ -69,7 +69,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What an alignment says: its words for people, and per pair of clouds (number, RMSE in metres, accepted)."""
+    """Hold what an alignment says: its words for people, and per pair of clouds (number, RMSE in metres, accepted)."""
 
     words: str
     pairs: Sequence[tuple[str, float, bool]] = ()

@@ -18,7 +18,7 @@ _ORDERS = (0, 2, 4)  # of the phase: offset, and the wiggling of sensors with fo
 
 
 class BurstNoise(NamedTuple):
-    """What it takes to draw the noise of a frame anew."""
+    """Hold what it takes to draw the noise of a frame anew."""
 
     averaged: float  #: frames that a given one is the mean of
     noise: TapNoise  #: of one tap of one frame

@@ -249,7 +249,7 @@ def _dilated(mask: Tensor, reach: int) -> Tensor:
 
 
 def _hit(target: Target) -> Tensor:
-    """Where there is ground truth, masked or not: :func:`tofcapture_model.data.make_target` gives the rest 1 m and (0, 0, -1)."""
+    """Tell where there is ground truth, masked or not: :func:`tofcapture_model.data.make_target` gives the rest 1 m and (0, 0, -1)."""
     placeholder = (target.depth == 1) & (target.normals[:, 2:] == -1)
     return target.good | target.context | ~placeholder
 

@@ -28,7 +28,7 @@ _HELD = 1 << 25  # elements of the table of distances
 
 
 class Taps(NamedTuple):
-    """What is sent to the device for one frame: taps (K, H, W) float32, sensor temperature () float32, NaN if unknown."""
+    """Hold what is sent to the device for one frame: taps (K, H, W) float32, sensor temperature () float32, NaN if unknown."""
 
     raw: Tensor
     celsius: Tensor

@@ -40,7 +40,7 @@ class _Watch(Protocol):
 
 
 class _Prepared(NamedTuple):
-    """What is ready for a camera: from taps and temperature to inputs on the device, from these to depth, normals, error, validity."""
+    """Hold what is ready for a camera: from taps and temperature to inputs on the device, from these to depth, normals, error, validity."""
 
     prepare: Callable[[NDArray[Any], float], Any]
     ask: Callable[[Any], tuple[Tensor, ...]]

@@ -1,4 +1,4 @@
-"""What a prediction is, and the files that hold one."""
+"""Define what a prediction is, and the files that hold one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a prediction is, at twice the sensor's resolution.
+    """Hold what a prediction is, at twice the sensor's resolution.
 
     Attributes
     ----------

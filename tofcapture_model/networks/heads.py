@@ -48,7 +48,7 @@ _GAIN_UNIT = 5.0  # gains learn at the pace of the weights of a layer, which mov
 
 
 class Features(NamedTuple):
-    """What the heads read."""
+    """Hold what the heads read."""
 
     image: Tensor  #: (B, C, H, W) for the convolutions, about unit scale
     candidates: Tensor  #: (B, K, H, W) classically denoised or corrected depths, m; K may be 0

@@ -32,7 +32,7 @@ class Network:
 
 @dataclass(frozen=True)
 class Sources:
-    """What the page is made from: folder and manifest of the dataset, parsed JSON, the network.
+    """Hold what the page is made from: folder and manifest of the dataset, parsed JSON, the network.
 
     A part that is None is reported as absent for the reason in ``absent``: ``dataset``, ``results``, ``evidence``, ``weights``.
     """

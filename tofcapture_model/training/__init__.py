@@ -103,7 +103,7 @@ def _own_gpu(device: torch.device, world: int) -> torch.device:
 
 @dataclass
 class Position:
-    """Where a run is; everything in it goes into the resume point."""
+    """Tell where a run is; everything in it goes into the resume point."""
 
     stage: int = 0  #: with epoch and batch: the next batch to take
     epoch: int = 0

@@ -101,7 +101,7 @@ def _data(dataset: Path, known: Mapping[str, Any]) -> str:
 
 
 def _frames(shards: Sequence[Path]) -> str:
-    """How many frames shards hold; a run on a packed cache may go without them."""
+    """Tell how many frames shards hold; a run on a packed cache may go without them."""
     total = 0
     try:
         for path in shards:

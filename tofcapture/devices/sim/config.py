@@ -40,7 +40,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Render:
-    """How finely the light is computed; see constants.toml."""
+    """Tell how finely the light is computed; see constants.toml."""
 
     multipath: bool = True
     subpixels: int = 4

@@ -158,7 +158,7 @@ class SimStereo(_InWorld, StereoDevice):
 
 
 class SimOperator(_InWorld, Operator):
-    """Who changes the scene in the simulated world, and knows the truth about it."""
+    """Tell who changes the scene in the simulated world, and knows the truth about it."""
 
     def place(self, scene: str) -> None:
         """Put the scene on the simulated table."""

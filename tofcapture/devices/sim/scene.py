@@ -1,4 +1,4 @@
-"""What stands in a scene, and what rays meet there.
+"""Define what stands in a scene, and what rays meet there.
 
 Embree (through open3d) finds the hits; normals are geometric, so a scene means the same to every renderer that reads the
 same triangles.
@@ -92,7 +92,7 @@ def merge(objects: Sequence[SceneObject]) -> Geometry:
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays meet the scene, flat arrays of the same length."""
+    """Tell where rays meet the scene, flat arrays of the same length."""
 
     distance: Float32  #: float32, metres along the unit ray; infinite where nothing was met.
     triangle: Int64  #: int64, -1 where nothing was met.

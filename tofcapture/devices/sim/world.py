@@ -44,7 +44,7 @@ from tofcapture.errors import ConfigError, MotionRefused
 
 @dataclass(frozen=True)
 class FaultPlan:
-    """What goes wrong when; see the module's head."""
+    """Hold what goes wrong when; see the module's head."""
 
     arm_refuses: tuple[int, ...] = ()
     tof_drops: tuple[int, ...] = ()

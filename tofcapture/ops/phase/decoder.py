@@ -104,7 +104,7 @@ _STEEP = float(np.tan(np.radians(80)))
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """What the decoder yields, each (H, W)."""
+    """Hold what the decoder yields, each (H, W)."""
 
     depth: Float32  #: float32, z, metres; NaN where a tap is saturated or nothing can be decoded.
     confidence: Float32  #: float32, amplitude of the high frequency, raw units.
@@ -113,7 +113,7 @@ class DepthMaps:
 
 @dataclass(frozen=True)
 class Signals:
-    """What was on the way from taps to depth."""
+    """Hold what was on the way from taps to depth."""
 
     phasor: Float32  #: (2, 2, H, W) float32: I and Q of the low, then of the high frequency; raw units.
     range_low: Float32  #: (H, W) by the low frequency alone, metres: half the path to the surface and back.

@@ -1,4 +1,4 @@
-"""What the fast decoder is made of: taps to I and Q, these to phase, phase to range; float32, in place.
+"""Define what the fast decoder is made of: taps to I and Q, these to phase, phase to range; float32, in place.
 
 Only additions, products, quotients and square roots are used, so that the same frame gives the same bits on every machine.
 """

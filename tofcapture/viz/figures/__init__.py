@@ -16,7 +16,7 @@ from tofcapture.viz.page import METADATA, canvas, save
 
 @dataclass(frozen=True)
 class Choice:
-    """What of a path is drawn: scene and view (``None``: the first, or as many scenes as there may be rows).
+    """Hold what of a path is drawn: scene and view (``None``: the first, or as many scenes as there may be rows).
 
     ``view`` is the number in the file's name or in the shard, ``prediction`` a folder that ``predict`` wrote or one of such
     folders named by scene, ``rig`` a ``rig.toml`` to use instead of the recording's.

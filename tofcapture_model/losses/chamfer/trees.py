@@ -170,7 +170,7 @@ class _Tree:
 
 
 class _Shift:
-    """What is known of one shift: answers of P in Q (way 0) and of Q in P, by the leaves of who asks."""
+    """Hold what is known of one shift: answers of P in Q (way 0) and of Q in P, by the leaves of who asks."""
 
     def __init__(self, trees: Sequence[_Tree], move: Sequence[float]) -> None:
         shape = (2, len(trees[0].leaves), FAN)
