@@ -12,8 +12,18 @@ from tofcapture.devices.console import ConsoleOperator
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.files.view import read_view, view_path
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
-from tofcapture.poses import rotation_exp, transform
-from tofcapture.record.quality import LIMITS, NOTE, REFUSE, RETAKE, broken_limits, measure, quality_table
+from tofcapture.poses import look_at, rotation_exp, transform
+from tofcapture.record.quality import (
+    LIMITS,
+    NOTE,
+    REFUSE,
+    RETAKE,
+    broken_limits,
+    lean_of,
+    measure,
+    meter,
+    quality_table,
+)
 from tofcapture.rig import Rig
 
 __all__ = ["_few_candidates"]  # applies here too
@@ -255,3 +265,36 @@ def test_a_burst_of_one_frame():
     numbers = measure(**{**parts, "tof": one, "frames": 1})
     assert broken_limits(numbers) == []
     assert set(numbers) == {check.name for check in LIMITS} - {"flicker"}
+
+
+# What the board views cover so far, from the arm's poses alone.
+METER = Camera(240, 180, 190.0, 200.0, 119.5, 89.5)
+BOARD, NORMAL = np.array([0.7, 0.0, -0.2]), np.array([0.0, 0.0, 1.0])
+
+
+def _board_view(tilt, turn, distance=0.7, roll=0.0):
+    tilt, turn = np.radians([tilt, turn])
+    way = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
+    return look_at(BOARD + distance * way, BOARD, roll=roll)
+
+
+def test_meter_counts_what_was_seen():
+    """Two views, of 20 and 30 degrees, 0.5 and 0.9 m away, are counted in their bins."""
+    text = meter([_board_view(20, 0, 0.5), _board_view(30, 90, 0.9)], BOARD, NORMAL, METER)
+    assert "2 board views, 0.50 to 0.90 m" in text
+    assert "15-25 deg 1" in text
+    assert "25-40 deg 1" in text
+    assert meter([], BOARD, NORMAL, METER) == "no board views yet"
+
+
+def test_roll_turns_the_lean():
+    """A camera turned by a quarter about its axis sees the board lean a quarter further."""
+    first, second = (lean_of(_board_view(30, 40, roll=r), NORMAL) for r in (0.0, np.pi / 2))
+    np.testing.assert_allclose(second, [first[1], -first[0]], atol=1e-12)
+    assert np.linalg.norm(first) == pytest.approx(np.sin(np.radians(30)))
+
+
+def test_a_board_that_stands_upright_in_the_image_faces_up_or_down():
+    """Seen from a tilt without roll, the front leans down the image: its upper edge is farther away."""
+    text = meter([_board_view(30, 10)], BOARD, NORMAL, METER)
+    assert "below 1" in text or "above 1" in text

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -54,12 +53,6 @@ def test_more_faults_in_motion(emulator, tmp_path, order):
     _fault_in_motion(emulator, tmp_path, order)
 
 
-def _read_on(arm):
-    for _ in range(100):
-        arm.state()
-        time.sleep(0.05)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("order", list(MOVING))
 def test_faults_at_rest(emulator, tmp_path, order):
@@ -67,7 +60,7 @@ def test_faults_at_rest(emulator, tmp_path, order):
     with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
         emulator.order(order)
         with pytest.raises(MOVING[order]):
-            _read_on(station.arm)
+            until(lambda: station.arm.state() is None)
 
 
 # The probe talks first; what it lets pass must hang the library: V, v and O are asked by both.
