@@ -396,10 +396,10 @@ def test_cli_errors_are_told_apart(daemon, tmp_path):
 
 def test_record_hands_over(daemon, tmp_path):
     """A scene of a recording under the daemon's root goes to its queue; any other, or without a daemon, does not."""
-    wish = {"scene": "mug", "views": 2, "frames": 1}
-    assert hand_over(tmp_path / "r", wish, daemon.state) is None
-    assert hand_over(daemon.root / "r", wish, tmp_path) is None
-    job = hand_over(daemon.root / "r", wish, daemon.state)
+    request = {"scene": "mug", "views": 2, "frames": 1}
+    assert hand_over(tmp_path / "r", request, daemon.state) is None
+    assert hand_over(daemon.root / "r", request, tmp_path) is None
+    job = hand_over(daemon.root / "r", request, daemon.state)
     assert (job["recording"], job["state"]) == ("r", "queued")
     assert daemon.ask("POST", f"/v1/jobs/{job['id']}/cancel")["state"] == "stopped"
 

@@ -12,23 +12,23 @@ pytest.importorskip("aiohttp")
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "kill_anywhere.py"
 
 
-def _torment(*options, seconds):
+def _strike(*options, seconds):
     command = [sys.executable, SCRIPT, *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=seconds)
     assert done.returncode == 0, done.stderr[-3000:]
     return json.loads(done.stdout)
 
 
-def test_a_few_blows_on_a_quick_station():
+def test_three_kills_and_a_full_disk():
     """Three kills and one full disk in a recording of arrays."""
-    told = _torment("--kills", "3", "--full", "1", "--views", "5", "--station", "arrays", seconds=290)
+    told = _strike("--kills", "3", "--full", "1", "--views", "5", "--station", "arrays", seconds=290)
     assert told["ok"]
     assert sum(told["blows"].values()) == 4
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_many_blows_on_the_simulated_station():
-    """Daemon, recorder and driver host are all struck, in simulated recordings."""
-    told = _torment("--kills", "30", "--full", "4", "--seed", "3", seconds=1700)
+def test_daemon_recorder_and_host_are_killed_in_simulated_recordings():
+    """Thirty kills and four full disks, of which each of the three processes has its share."""
+    told = _strike("--kills", "30", "--full", "4", "--seed", "3", seconds=1700)
     assert {"daemon", "recorder", "host"} <= told["blows"].keys()

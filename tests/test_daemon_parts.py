@@ -42,11 +42,11 @@ def _decoded(png):
 
 def test_queue_outlives_its_process(tmp_path):
     """Jobs, events and numbers of events go on where they were; a request id counts once."""
-    wish = {"request_id": "a", "recording": "r", "scene": "s", "views": 2, "frames": 1}
+    request = {"request_id": "a", "recording": "r", "scene": "s", "views": 2, "frames": 1}
     queue = store.Store(tmp_path / "q")
-    job, new = queue.add(wish)
+    job, new = queue.add(request)
     assert new
-    assert queue.add(wish) == (job, False)
+    assert queue.add(request) == (job, False)
     queue.move(job.id, "running")
     first = queue.remember("log", {"text": "x"})
     queue.close()
@@ -55,7 +55,7 @@ def test_queue_outlives_its_process(tmp_path):
     assert queue.remember("log", {}).id == first.id + 1
     assert [event.id for event in queue.events(first.id)] == [first.id + 1]
     with pytest.raises(BusyError):
-        queue.add({**wish, "views": 3})
+        queue.add({**request, "views": 3})
     with pytest.raises(DataError):
         queue.job(99)
     queue.close()

@@ -327,7 +327,7 @@ def test_refused_motion_is_not_repeated(tmp_path):
     assert len(result.recorded) == VIEWS - 1
 
 
-def test_full_disk_and_wrong_wishes_are_refused(tmp_path, monkeypatch):
+def test_full_disk_and_wrong_arguments_are_refused(tmp_path, monkeypatch):
     """Too little disk, no views and unsafe names are refused before anything moves."""
     bench = Bench()
     with pytest.raises(ConfigError, match="views"):

@@ -138,7 +138,7 @@ def test_a_damaged_or_missing_shard_is_made_again(tmp_path, whole):
         simulate_dataset(spec(scenes=1), out, jobs=1)
 
 
-def test_views_of_another_wish_are_not_mixed_in(tmp_path, whole):
+def test_views_of_another_recipe_are_not_mixed_in(tmp_path, whole):
     """Views left by a run with other options go before the scene is taken."""
     out = tmp_path / "data"
     other = DatasetSpec("multipath", 0, 2, views=2, frames=1, sim=SIM)
