@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import PATIENCE
 from tests.test_daemon_api import ROOT, STATION, running
 
 pytestmark = pytest.mark.slow
@@ -30,6 +31,7 @@ def page():
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1200, "height": 1000})
+        page.set_default_timeout(1000 * PATIENCE)
         page.may_fail, said = False, []
         page.on(
             "console",
@@ -41,9 +43,9 @@ def page():
         assert [text for text in said if "Failed to load resource" not in text or not page.may_fail] == []
 
 
-def _until(page, expression, seconds=180.0):
+def _until(page, expression):
     """Wait until an expression holds; the page's own policy forbids Playwright to evaluate text by itself."""
-    end = time.monotonic() + seconds
+    end = time.monotonic() + PATIENCE
     while not page.evaluate(expression):
         assert time.monotonic() < end, expression
         page.wait_for_timeout(50)

@@ -258,11 +258,12 @@ def test_page_opens_in_chromium_and_asks_nobody_else(server):
         ]
         browser = play.chromium.launch(executable_path=CHROMIUM, args=flags)
         page = browser.new_page(viewport={"width": 1200, "height": 800})
+        page.set_default_timeout(1000 * PATIENCE)
         page.on("request", lambda r: asked.append(r.url))
         page.on("console", lambda m: said.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda e: said.append(str(e)))
         page.goto(f"http://127.0.0.1:{server.server_port}")
-        end = time.monotonic() + 120
+        end = time.monotonic() + PATIENCE
         while not any(url.endswith("/view.rrd") for url in asked) and time.monotonic() < end:
             page.wait_for_timeout(500)
         page.wait_for_timeout(5000)
