@@ -10,15 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.alignment.averages import average_transforms
 from calibration.hand_eye.checks import check_motion, clean
-from calibration.hand_eye.closed_form import invert_all, park_martin, rotation_vectors
+from calibration.hand_eye.closed_form import hats, invert_all, moved, park_martin, rotation_vectors
 from tofcapture.errors import QualityError
-from tofcapture.poses import Float64, exp, hat, invert, log
+from tofcapture.poses import Float64, exp, hat, invert, log, rotation_log
+from tofcapture.rig import Rig
 
 CAMERAS = ("tof", "stereo")
 ARM_SIGMA = (
@@ -29,6 +31,7 @@ MIN_FITS = 5  # of each camera: six unknowns each, and one to spare
 STEPS = 50
 STOP = 1e-9  # m and rad
 FREEDOM = 8.0  # degrees of freedom of Student's t: efficient on Gaussian noise, and outliers lose their vote
+AGREES = 3.0  # standard deviations per degree of freedom between the two rig transforms
 OUTLIER = 0.3  # weight below which a fit has lost its vote
 
 
@@ -112,8 +115,8 @@ def solve_bundle(
     for _ in range(STEPS):
         H, g = seen.normal_equations(r, J, E)
         step = np.asarray(-np.linalg.solve(H, g), dtype=np.float64)
-        X = [_moved(T, step[6 * i : 6 * i + 6]) for i, T in enumerate(X)]
-        Z = _moved(Z, step[12:18])
+        X = [moved(T, step[6 * i : 6 * i + 6]) for i, T in enumerate(X)]
+        Z = moved(Z, step[12:18])
         E = np.stack([exp(s) @ T for s, T in zip(step[18:].reshape(-1, 6), E, strict=True)])
         r, J = seen.linearised(X, Z, E)
         if np.abs(step).max() < STOP:
@@ -144,12 +147,6 @@ def _start(A: Float64, fits: Sequence[BoardFit]) -> tuple[tuple[float, float, fl
     return min(motions, key=lambda m: m[1]), found, Z
 
 
-def _moved(T: Float64, step: Float64) -> Float64:
-    out = exp(np.concatenate([np.zeros(3), step[3:]])) @ T
-    out[:3, 3] = T[:3, 3] + step[:3]
-    return out
-
-
 @dataclass(frozen=True)
 class _Observations:
     """K board fits over N arm poses."""
@@ -171,7 +168,7 @@ class _Observations:
         camera = np.stack(X)[self.camera]
         flange_board = invert_all(T_base_flange) @ Z
         predicted = invert_all(camera) @ flange_board
-        moved = self.board[:, :3, 3] - predicted[:, :3, 3]
+        shifted = self.board[:, :3, 3] - predicted[:, :3, 3]
         turned = rotation_vectors(self.board[:, :3, :3] @ np.swapaxes(predicted[:, :3, :3], 1, 2))
         back = np.swapaxes(camera[:, :3, :3], 1, 2)
         to_base = back @ np.swapaxes(T_base_flange[:, :3, :3], 1, 2)
@@ -180,10 +177,10 @@ class _Observations:
         error = back @ np.swapaxes(E[self.view][:, :3, :3], 1, 2)
         before = (invert_all(self.arm[self.view]) @ Z)[:, :3, 3]
         J = np.zeros((len(self.view), 6, 18))
-        J[:, :3, 0:3], J[:, :3, 3:6], J[:, 3:, 3:6] = back, -back @ _hats(lever), back
+        J[:, :3, 0:3], J[:, :3, 3:6], J[:, 3:, 3:6] = back, -back @ hats(lever), back
         J[:, :3, 6:9], J[:, 3:, 9:12] = -to_base, -to_base
-        J[:, :3, 12:15], J[:, :3, 15:18], J[:, 3:, 15:18] = error, -error @ _hats(before), error
-        return np.concatenate([moved, turned], axis=1), J
+        J[:, :3, 12:15], J[:, :3, 15:18], J[:, 3:, 15:18] = error, -error @ hats(before), error
+        return np.concatenate([shifted, turned], axis=1), J
 
     def normal_equations(self, r: Float64, J: Float64, E: Float64) -> tuple[Float64, Float64]:
         """``J^T W J`` and ``J^T W r`` in (X_tof, X_stereo, Z, E_1 ... E_N), the arm's prior included."""
@@ -221,6 +218,57 @@ class _Observations:
         return np.asarray(np.einsum("ki,ki->k", r, np.linalg.solve(self.covariance, r[..., None])[..., 0]))
 
 
-def _hats(v: Float64) -> Float64:
-    """Cross-product matrices (K, 3, 3) of vectors (K, 3)."""
-    return np.cross(v[:, None], np.eye(3)).swapaxes(1, 2)
+def bundle_report(bundle: Bundle, fits: Sequence[BoardFit], rig: Rig) -> dict[str, Any]:
+    """Lay a bundle out as JSON types, with its consistency with the rig's ``T_tof_stereo``."""
+    places = {
+        "T_flange_tof": bundle.T_flange_tof,
+        "T_flange_stereo": bundle.T_flange_stereo,
+        "T_base_board": bundle.T_base_board,
+    }
+    arm = np.sqrt(np.square(bundle.arm.reshape(-1, 2, 3)).mean(axis=(0, 2)))
+    return {
+        "format": "tofcapture-bundle",
+        "version": 1,
+        "units": "m",
+        **{name: T.tolist() for name, T in places.items()},
+        "standard_error": {name: _stated(bundle.sigma(i)) for i, name in enumerate(places)},
+        "covariance": bundle.covariance.tolist(),
+        "variance_factor": bundle.variance,
+        "views": len(bundle.arm),
+        "fits": {c: sum(f.camera == c for f in fits) for c in ("tof", "stereo")},
+        "outliers": [
+            f"view {f.view} {f.camera}" for f, bad in zip(fits, bundle.outliers, strict=True) if bad
+        ],
+        "arm_rms": {"translation_mm": 1e3 * float(arm[0]), "rotation_deg": float(np.degrees(arm[1]))},
+        "motion_deg": np.degrees(bundle.motion).tolist(),
+        "rig_check": consistency(bundle, rig.T_tof_stereo),
+        "moved": _difference(bundle.T_flange_tof, rig.T_flange_tof),
+    }
+
+
+def consistency(bundle: Bundle, T_tof_stereo: Float64) -> dict[str, Any]:
+    """Compare ``X_tof^-1 X_stereo`` with the rig transform that registration found, in the bundle's own standard deviations."""
+    D = T_tof_stereo @ invert(bundle.T_tof_stereo)
+    off = np.concatenate([T_tof_stereo[:3, 3] - bundle.T_tof_stereo[:3, 3], rotation_log(D[:3, :3])])
+    distance = float(np.sqrt(off @ np.linalg.solve(bundle.rig_covariance(), off) / 6))
+    return {
+        **_difference(bundle.T_tof_stereo, T_tof_stereo),
+        "standard_error": _stated(np.sqrt(np.diag(bundle.rig_covariance()))),
+        "sigmas": distance,
+        "agrees": distance < AGREES,
+    }
+
+
+def _difference(one: Float64, other: Float64) -> dict[str, float]:
+    turned = rotation_log(one[:3, :3].T @ other[:3, :3])
+    return {
+        "translation_mm": 1e3 * float(np.linalg.norm(one[:3, 3] - other[:3, 3])),
+        "rotation_deg": float(np.degrees(np.linalg.norm(turned))),
+    }
+
+
+def _stated(sigma: Float64) -> dict[str, list[float]]:
+    return {
+        "translation_mm": (1e3 * sigma[:3]).tolist(),
+        "rotation_deg": np.degrees(sigma[3:]).tolist(),
+    }

@@ -12,18 +12,19 @@ import ezdxf
 import numpy as np
 import pytest
 
-from calibration.board.coverage import coverage, meter
+from calibration.board.coverage import missing
 from calibration.board.detector import detect
 from calibration.board.drawing import describe, dxf, stl, svg
 from calibration.board.fit import Model, Sight, on_front, refine
-from calibration.board.geometry import Board, board_from, distance_to_ring, inside, load_board, symmetries
+from calibration.board.geometry import Board, board_from, distance_to_ring, load_board, symmetries
 from tests.commands import calibrate
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.shapes import BOARD_SIZE
 from tofcapture.devices.sim.shapes import board as simulated_board
 from tofcapture.errors import ConfigError, QualityError
-from tofcapture.meshes import circle, extrude, rectangle
+from tofcapture.meshes import circle, extrude, inside, rectangle
 from tofcapture.poses import exp, invert, look_at, rotation_angle, rotation_log, transform_points
+from tofcapture.record.quality import coverage, meter
 
 CAMERA = Camera(240, 180, 190.6186, 200.7526, 116.8406, 101.4767)
 BLANK = {
@@ -285,22 +286,22 @@ def test_rays_meet_the_front():
 def test_coverage_names_what_is_missing():
     """One frontal view misses everything; nine views all round at two distances miss nothing but corners of the image."""
     outline = load_board().outline
-    one = coverage([pose(2.0)], CAMERA, outline)
-    assert len(one["missing"]) >= 4
-    assert any("tilts" in m for m in one["missing"])
+    one = missing(coverage([pose(2.0)], CAMERA, outline))
+    assert len(one) >= 4
+    assert any("tilts" in m for m in one)
     poses = [pose(28.0, 45.0 * i, 0.0, 0.5 + 0.05 * i) for i in range(9)]
     many = coverage(poses, CAMERA, outline)
     assert sum(n > 0 for n in many["sectors"].values()) >= 6
-    assert many["missing"] == []
+    assert missing(many) == []
     np.testing.assert_allclose(many["tilt_deg"], 28.0, atol=3.0)
-    assert "missing    nothing" in meter(many)
+    assert "9 board views, 0.50 to 0.90 m" in meter(many)
 
 
 def test_coverage_of_nothing():
     """No view yet: any view is missing."""
     none = coverage([], CAMERA, load_board().outline)
-    assert none["missing"] == ["any board view"]
-    assert "0 views" in meter(none)
+    assert missing(none) == ["any board view"]
+    assert meter(none) == "no board views yet"
 
 
 def test_circle_segments_are_inside_the_circle():

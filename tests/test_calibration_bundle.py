@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.bundle import ARM_SIGMA, BoardFit, solve_bundle
-from calibration.cli.hand_eye import consistency
+from calibration.bundle import ARM_SIGMA, BoardFit, consistency, solve_bundle
 from calibration.hand_eye.checks import Cause, HandEyeRefused
 from tofcapture import poses
 from tofcapture.errors import QualityError

@@ -10,9 +10,9 @@ from tofcapture.devices.clearance import is_clear, obstacles, route, stage_of
 from tofcapture.devices.kinematics import HOME, MODELS, forward
 from tofcapture.devices.station import read_station
 from tofcapture.errors import ConfigError, MotionRefused
-from tofcapture.poses import rotation_exp, transform
+from tofcapture.poses import invert, rotation_exp, transform
 from tofcapture.record.plan import board_sampling, object_sampling, plan_views
-from tofcapture.record.quality import SECTORS, lean_of
+from tofcapture.record.quality import board_pose, coverage
 from tofcapture.rig import Rig
 
 UR10E = MODELS["ur10e"]
@@ -121,9 +121,9 @@ def test_board_views_tilt_in_all_directions(seed):
     side = np.array([v.direction - (v.direction @ normal) * normal for v in plan.views])
     assert np.linalg.eigvalsh(side.T @ side)[1] > 0.5
     assert all(0.5 <= v.distance <= 1.1 for v in plan.views)
-    leans = np.array([lean_of(v.T_base_flange @ RIG.T_flange_tof, STAGE.board_normal) for v in plan.views])
-    sector = np.round(np.arctan2(leans[:, 1], leans[:, 0]) / (np.pi / 4)).astype(int) % len(SECTORS)
-    counts = np.bincount(sector, minlength=8)
+    T_base_board = board_pose(STAGE.board, STAGE.board_normal)
+    poses = [invert(v.T_base_flange @ RIG.T_flange_tof) @ T_base_board for v in plan.views]
+    counts = np.array(list(coverage(poses, CAMERA)["sectors"].values()))
     assert (counts > 0).sum() >= 6
     assert counts.max() <= 4
 

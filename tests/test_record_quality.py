@@ -12,14 +12,15 @@ from tofcapture.devices.console import ConsoleOperator
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.files.view import read_view, view_path
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
-from tofcapture.poses import look_at, rotation_exp, transform
+from tofcapture.poses import invert, look_at, rotation_exp, transform
 from tofcapture.record.quality import (
     LIMITS,
     NOTE,
     REFUSE,
     RETAKE,
+    board_pose,
     broken_limits,
-    lean_of,
+    coverage,
     measure,
     meter,
     quality_table,
@@ -278,23 +279,26 @@ def _board_view(tilt, turn, distance=0.7, roll=0.0):
     return look_at(BOARD + distance * way, BOARD, roll=roll)
 
 
+def _covered(*views):
+    return coverage([invert(T) @ board_pose(BOARD, NORMAL) for T in views], METER)
+
+
 def test_meter_counts_what_was_seen():
     """Two views, of 20 and 30 degrees, 0.5 and 0.9 m away, are counted in their bins."""
-    text = meter([_board_view(20, 0, 0.5), _board_view(30, 90, 0.9)], BOARD, NORMAL, METER)
+    text = meter(_covered(_board_view(20, 0, 0.5), _board_view(30, 90, 0.9)))
     assert "2 board views, 0.50 to 0.90 m" in text
     assert "15-25 deg 1" in text
     assert "25-40 deg 1" in text
-    assert meter([], BOARD, NORMAL, METER) == "no board views yet"
+    assert meter(_covered()) == "no board views yet"
 
 
 def test_roll_turns_the_lean():
     """A camera turned by a quarter about its axis sees the board lean a quarter further."""
-    first, second = (lean_of(_board_view(30, 40, roll=r), NORMAL) for r in (0.0, np.pi / 2))
-    np.testing.assert_allclose(second, [first[1], -first[0]], atol=1e-12)
-    assert np.linalg.norm(first) == pytest.approx(np.sin(np.radians(30)))
+    first, second = _covered(*(_board_view(30, 40, roll=r) for r in (0.0, np.pi / 2)))["lean_deg"]
+    assert (first - second) % 360 == pytest.approx(90)
 
 
 def test_a_board_that_stands_upright_in_the_image_faces_up_or_down():
     """Seen from a tilt without roll, the front leans down the image: its upper edge is farther away."""
-    text = meter([_board_view(30, 10)], BOARD, NORMAL, METER)
+    text = meter(_covered(_board_view(30, 10)))
     assert "below 1" in text or "above 1" in text

@@ -24,6 +24,17 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 SUFFIXES = (".ply", ".obj", ".stl")
 
 
+def inside(polygon: Float64, points: Float64) -> NDArray[np.bool_]:
+    """Say which points (..., 2) lie in a simple polygon (N, 2), by crossings of the ray to the right."""
+    x, y = points[..., None, 0], points[..., None, 1]
+    x0, y0 = polygon.T
+    x1, y1 = np.roll(polygon, -1, axis=0).T
+    straddles = (y0 > y) != (y1 > y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = x0 + (y - y0) / (y1 - y0) * (x1 - x0)
+    return np.asarray((straddles & (x < at)).sum(axis=-1) % 2 == 1)
+
+
 def metres_per(unit: str, where: str) -> float:
     """Look up the metres in one unit; :class:`ConfigError` on anything but m, cm, mm."""
     if unit not in UNITS:

@@ -13,12 +13,13 @@ from enum import StrEnum
 import numpy as np
 
 from calibration.board.fit import PITCH, SCALES, Fit, Model, Sight, clear_of_walls, on_front, refine
-from calibration.board.geometry import Board, distance_to_ring, inside, sampled
+from calibration.board.geometry import Board, distance_to_ring, sampled
 from calibration.registration.clouds import stereo_cloud, surface_points, tof_depth
 from calibration.registration.rims import stereo_rims, tof_rims
 from tofcapture.camera import Camera
 from tofcapture.errors import QualityError
 from tofcapture.frames import StereoFrame, TofBurst
+from tofcapture.meshes import inside
 from tofcapture.poses import Float64, invert, rotation_angle, rotation_exp, transform, transform_points
 
 # Planes, and candidates on them.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 from io import StringIO
+from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
@@ -89,6 +90,19 @@ def stl(board: Board) -> bytes:
     vertices, triangles = extrude(board.outline, board.thickness, board.rings[1:])
     mesh = trimesh.Trimesh(1e3 * vertices, triangles, process=False)
     return bytes(mesh.export(file_type="stl"))
+
+
+def configure_board(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        "--board",
+        default="default",
+        help="packaged board (default, second) or a TOML file; see docs/board.md",
+    )
+    for kind, words in (("svg", "to print"), ("dxf", "to cut"), ("stl", "to print in 3-D")):
+        parser.add_argument(
+            f"--{kind}", type=Path, metavar="OUT", help=f"write the drawing {words}, true scale"
+        )
 
 
 def run_board(args: argparse.Namespace) -> Outcome:

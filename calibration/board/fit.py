@@ -14,8 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.geometry import Board, inside
+from calibration.board.geometry import Board
 from calibration.registration.gate import tukey_weights
+from tofcapture.meshes import inside
 from tofcapture.poses import Float64, exp, hat, invert, transform_points
 
 WALL = 0.0004  # m of the board's side in sight beyond a rim, above which the rim is the back's or a mixture, and does not count

@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError
-from tofcapture.meshes import circle, signed_area
+from tofcapture.meshes import circle, inside, signed_area
 from tofcapture.poses import Float64
 
 BOARDS = Path(__file__).with_name("boards")
@@ -123,17 +122,6 @@ def _check_cuttable(board: Board, where: str) -> None:
             raise ConfigError(
                 f"{where}: holes {a.name!r} and {b.name!r}: expected {MIN_WEB} m of material between them"
             )
-
-
-def inside(polygon: Float64, points: Float64) -> NDArray[np.bool_]:
-    """Say which points (..., 2) lie in a simple polygon (N, 2), by crossings of the ray to the right."""
-    x, y = points[..., None, 0], points[..., None, 1]
-    x0, y0 = polygon.T
-    x1, y1 = np.roll(polygon, -1, axis=0).T
-    straddles = (y0 > y) != (y1 > y)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at = x0 + (y - y0) / (y1 - y0) * (x1 - x0)
-    return np.asarray((straddles & (x < at)).sum(axis=-1) % 2 == 1)
 
 
 def distance_to_ring(polygon: Float64, points: Float64) -> Float64:

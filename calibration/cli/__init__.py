@@ -23,8 +23,8 @@ _PARTS = {
         "cli.sensor",
         "what the ToF camera measures too long, per frequency, from board views at many distances",
     ),
-    "board": ("cli.hand_eye", "draw the board to print or cut it"),
-    "coverage": ("cli.hand_eye", "what the board views of a recording cover, and what is missing"),
+    "board": ("board.drawing", "draw the board to print or cut it"),
+    "coverage": ("board.coverage", "what the board views of a recording cover, and what is missing"),
 }
 
 

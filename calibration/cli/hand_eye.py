@@ -13,17 +13,15 @@ from calibration.cli.sensor import add_recording, believed_rig, read_views, save
 from tofcapture.cli import kit
 from tofcapture.cli.kit import Outcome
 from tofcapture.errors import DataError, QualityError, UsageError
-from tofcapture.poses import Float64, invert, rotation_log
+from tofcapture.poses import Float64, rotation_log
 
 if TYPE_CHECKING:
     from calibration.board.geometry import Board
-    from calibration.bundle import BoardFit, Bundle
+    from calibration.bundle import BoardFit
     from calibration.hand_eye.solve import HandEye
     from tofcapture.frames import View
-    from tofcapture.rig import Rig
 
 STREAM_BLOCKS = 20  # stretches of a stream whose errors are taken as independent
-AGREES = 3.0  # standard deviations per degree of freedom between the two rig transforms
 
 
 def configure_hand_eye(parser: argparse.ArgumentParser) -> None:
@@ -149,7 +147,7 @@ def configure_bundle(parser: argparse.ArgumentParser) -> None:
 def run_bundle(args: argparse.Namespace) -> Outcome:
     """Detect the board in every view, solve the bundle, write ``T_flange_tof`` into ``rig.toml`` and ``bundle.json``."""
     from calibration.board.geometry import load_board
-    from calibration.bundle import ARM_SIGMA, solve_bundle
+    from calibration.bundle import ARM_SIGMA, bundle_report, solve_bundle
 
     board, rig = load_board(args.board), believed_rig(args.recording)
     arm, fits, refused = [], [], []
@@ -183,62 +181,6 @@ def _fits_of(view: View, index: int, board: Board) -> tuple[list[BoardFit], list
     return fits, refused
 
 
-def bundle_report(bundle: Bundle, fits: list[BoardFit], rig: Rig) -> dict[str, Any]:
-    """Lay a bundle out as JSON types, with its consistency with the rig's ``T_tof_stereo``."""
-    places = {
-        "T_flange_tof": bundle.T_flange_tof,
-        "T_flange_stereo": bundle.T_flange_stereo,
-        "T_base_board": bundle.T_base_board,
-    }
-    arm = np.sqrt(np.square(bundle.arm.reshape(-1, 2, 3)).mean(axis=(0, 2)))
-    return {
-        "format": "tofcapture-bundle",
-        "version": 1,
-        "units": "m",
-        **{name: T.tolist() for name, T in places.items()},
-        "standard_error": {name: _stated(bundle.sigma(i)) for i, name in enumerate(places)},
-        "covariance": bundle.covariance.tolist(),
-        "variance_factor": bundle.variance,
-        "views": len(bundle.arm),
-        "fits": {c: sum(f.camera == c for f in fits) for c in ("tof", "stereo")},
-        "outliers": [
-            f"view {f.view} {f.camera}" for f, bad in zip(fits, bundle.outliers, strict=True) if bad
-        ],
-        "arm_rms": {"translation_mm": 1e3 * float(arm[0]), "rotation_deg": float(np.degrees(arm[1]))},
-        "motion_deg": np.degrees(bundle.motion).tolist(),
-        "rig_check": consistency(bundle, rig.T_tof_stereo),
-        "moved": _difference(bundle.T_flange_tof, rig.T_flange_tof),
-    }
-
-
-def consistency(bundle: Bundle, T_tof_stereo: Float64) -> dict[str, Any]:
-    """Compare ``X_tof^-1 X_stereo`` with the rig transform that registration found, in the bundle's own standard deviations."""
-    D = T_tof_stereo @ invert(bundle.T_tof_stereo)
-    off = np.concatenate([T_tof_stereo[:3, 3] - bundle.T_tof_stereo[:3, 3], rotation_log(D[:3, :3])])
-    distance = float(np.sqrt(off @ np.linalg.solve(bundle.rig_covariance(), off) / 6))
-    return {
-        **_difference(bundle.T_tof_stereo, T_tof_stereo),
-        "standard_error": _stated(np.sqrt(np.diag(bundle.rig_covariance()))),
-        "sigmas": distance,
-        "agrees": distance < AGREES,
-    }
-
-
-def _difference(one: Float64, other: Float64) -> dict[str, float]:
-    turned = rotation_log(one[:3, :3].T @ other[:3, :3])
-    return {
-        "translation_mm": 1e3 * float(np.linalg.norm(one[:3, 3] - other[:3, 3])),
-        "rotation_deg": float(np.degrees(np.linalg.norm(turned))),
-    }
-
-
-def _stated(sigma: Float64) -> dict[str, list[float]]:
-    return {
-        "translation_mm": (1e3 * sigma[:3]).tolist(),
-        "rotation_deg": np.degrees(sigma[3:]).tolist(),
-    }
-
-
 def bundle_table(data: dict[str, Any]) -> str:
     """Lay the report out for a person."""
     rows = [
@@ -264,36 +206,3 @@ def bundle_table(data: dict[str, Any]) -> str:
 
 def _gap(found: dict[str, Any]) -> str:
     return f"{found['translation_mm']:.2f} mm, {found['rotation_deg']:.3f} deg"
-
-
-def configure_board(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    parser.add_argument(
-        "--board",
-        default="default",
-        help="packaged board (default, second) or a TOML file; see docs/board.md",
-    )
-    for kind, words in (("svg", "to print"), ("dxf", "to cut"), ("stl", "to print in 3-D")):
-        parser.add_argument(
-            f"--{kind}", type=Path, metavar="OUT", help=f"write the drawing {words}, true scale"
-        )
-
-
-def run_board(args: argparse.Namespace) -> Outcome:
-    """Draw a board."""
-    from calibration.board.drawing import run_board
-
-    return run_board(args)
-
-
-def configure_coverage(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    parser.add_argument("recording", type=Path, metavar="RECORDING", help="folder with calibration views")
-    parser.add_argument("--board", default="default", help="packaged board or a TOML file")
-
-
-def run_coverage(args: argparse.Namespace) -> Outcome:
-    """Print what the views cover."""
-    from calibration.board.coverage import run_coverage
-
-    return run_coverage(args)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calibration.alignment.rounds import free_of
-from calibration.board.coverage import coverage
+from calibration.board.coverage import missing
 from calibration.evidence import Drift, OldRig, covariance_of, drift, read_evidence
 from calibration.limits import LIMITS, Judged, judged, worst
 from calibration.registration.clouds import stereo_cloud, surface_points, tof_depth
@@ -21,6 +21,7 @@ from tofcapture.camera import Camera
 from tofcapture.colours import Scale
 from tofcapture.frames import View
 from tofcapture.poses import Float64, check_transform, invert, transform
+from tofcapture.record.quality import CELLS, coverage
 from tofcapture.rig import SPEED_OF_LIGHT, range_error_from
 from tofcapture.viz import page as charts
 from tofcapture.viz.page import write_page
@@ -29,7 +30,6 @@ Progress = Callable[[str, int, int], None]
 MOST_VIEWS = 24  # views that are read for the page, evenly; each costs a second
 MOST_POINTS = 6000  # surface points per view
 COMPONENTS = ("tx", "ty", "tz", "rx", "ry", "rz")
-GRID = (9, 12)  # cells of the image, as in calibration.board.coverage
 FEWEST = 30  # points below which a cell of the image has no median
 _LIMIT = 5.0  # mm, ends of the residuals' axes
 _ERRORS = Scale("RdBu_r", -3.0, 3.0, "mm")
@@ -139,7 +139,7 @@ def page_content(
         "pairs": evidence["pairs"],
         "spread_charts": _spread_charts(evidence["pairs"]),
         "residual_charts": _residual_charts(samples, wave),
-        "missing": covered["missing"],
+        "missing": missing(covered),
         "coverage_charts": _coverage_charts(covered),
         "uncertainty": _uncertainty(evidence),
         "observability": _observability(evidence),
@@ -169,7 +169,7 @@ def _judge_residuals(samples: Samples, wave: tuple[Float64, Float64] | None) -> 
 
 def image_medians(samples: Samples) -> Float64:
     """Median residual (9, 12) of each cell of the image, millimetres; NaN where there are too few points."""
-    rows, columns = GRID
+    rows, columns = CELLS
     height, width = samples.camera.shape
     r = np.clip((samples.pixel[:, 1] + 0.5) * rows / height, 0, rows - 1).astype(int)
     c = np.clip((samples.pixel[:, 0] + 0.5) * columns / width, 0, columns - 1).astype(int)
@@ -178,7 +178,7 @@ def image_medians(samples: Samples) -> Float64:
         inside = samples.residual[r * columns + c == cell]
         if len(inside) >= FEWEST:
             out[cell] = 1e3 * np.median(inside)
-    return out.reshape(GRID)
+    return out.reshape(CELLS)
 
 
 def _judge_coverage(covered: Mapping[str, Any]) -> list[Judged]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.poses import Float64, transform
+from tofcapture.poses import Float64, rotation_exp, transform
 
 NEAR_PI = np.radians(170)  # beyond it the sign of a rotation vector is noise
 SCALE = (
@@ -34,6 +34,16 @@ def invert_all(T: Float64) -> Float64:
     out[..., :3, 3] = -(out[..., :3, :3] @ T[..., :3, 3:])[..., 0]
     out[..., 3, 3] = 1
     return out
+
+
+def hats(v: Float64) -> Float64:
+    """Cross-product matrices (N, 3, 3) of vectors (N, 3)."""
+    return np.cross(v[:, None], np.eye(3)).swapaxes(1, 2)
+
+
+def moved(T: Float64, step: Float64) -> Float64:
+    """Transform (4, 4) after a step (6,): displacement of its origin, rotation vector in the left tangent space."""
+    return transform(rotation_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3])
 
 
 def rotation_vectors(R: Float64) -> Float64:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.hand_eye.closed_form import consensus, residuals
-from tofcapture.poses import Float64, rotation_exp, transform
+from calibration.hand_eye.closed_form import consensus, hats, moved, residuals
+from tofcapture.poses import Float64
 
 FREEDOM = 8.0  # degrees of freedom of Student's t: efficient on Gaussian noise, and outliers lose their vote
 PRIOR = 12.0  # pairs' worth of belief that the camera's scatter is isotropic in each half
@@ -83,7 +83,7 @@ def refine(
         information = _inverse(_total(camera, arm, lever))
         weight = _weights(r, information)
         step = _solve(J, r, weight, information)
-        X, Z = _moved(X, step[:6]), _moved(Z, step[6:])
+        X, Z = moved(X, step[:6]), moved(Z, step[6:])
         camera, arm = _sources(residuals(P, B, X, Z), weight, camera, arm, lever, information)
         if np.abs(step).max() < 1e-9:
             break
@@ -103,14 +103,8 @@ def _lever(P: Float64, X: Float64, Z: Float64, *, eye_to_hand: bool) -> Float64:
         board = np.einsum("nji,nj->ni", P[:, :3, :3], Z[:3, 3] - P[:, :3, 3])
     out = np.zeros((len(P), 6, 6))
     out[:, :3, :3], out[:, 3:, 3:] = -turn, -turn
-    out[:, :3, 3:] = turn @ _hats(board)
+    out[:, :3, 3:] = turn @ hats(board)
     return out
-
-
-def _hats(y: Float64) -> Float64:
-    o = np.zeros(len(y))
-    flat = np.stack([o, -y[:, 2], y[:, 1], y[:, 2], o, -y[:, 0], -y[:, 1], y[:, 0], o], axis=1)
-    return flat.reshape(-1, 3, 3)
 
 
 def _total(camera: Float64, arm: Float64, lever: Float64) -> Float64:
@@ -144,15 +138,11 @@ def jacobian(P: Float64, X: Float64, Z: Float64) -> Float64:
     y = np.einsum("nij,nj->ni", R_Pt, Z[:3, 3] - P[:, :3, 3]) - X[:3, 3]
     J = np.zeros((len(P), 6, 12))
     J[:, :3, 0:3] = -back
-    J[:, :3, 3:6] = back @ _hats(y)
+    J[:, :3, 3:6] = back @ hats(y)
     J[:, :3, 6:9] = back @ R_Pt
     J[:, 3:, 3:6] = -back
     J[:, 3:, 9:12] = back @ R_Pt
     return J
-
-
-def _moved(T: Float64, step: Float64) -> Float64:
-    return transform(rotation_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3])
 
 
 def _mahalanobis2(r: Float64, information: Float64) -> Float64:

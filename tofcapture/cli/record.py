@@ -88,13 +88,15 @@ class _BoardMeter(Observer):
     def sealed(self, view: View, sha256: str) -> None:
         """Print the meter."""
         from tofcapture.devices.clearance import stage_of
-        from tofcapture.record.quality import meter
+        from tofcapture.poses import invert
+        from tofcapture.record.quality import board_pose, coverage, meter
 
         del sha256
         self._there.append(view.index)
         stage, camera = stage_of(self._station.config), self._station.rig.tof
-        poses = [self._poses[i] for i in self._there]
-        print(meter(poses, stage.board, stage.board_normal, camera), file=sys.stderr, flush=True)
+        T_base_board = board_pose(stage.board, stage.board_normal)
+        found = coverage([invert(self._poses[i]) @ T_base_board for i in self._there], camera)
+        print(meter(found), file=sys.stderr, flush=True)
 
 
 def _handed_over(args: argparse.Namespace, scene: str, views: int) -> Outcome | None:

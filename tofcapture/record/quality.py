@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.frames import ArmState, StereoFrame, TofBurst
+from tofcapture.meshes import inside
 from tofcapture.ops.phase import mean_phasors
-from tofcapture.poses import Float64, invert, look_at, rotation_angle, transform_points
+from tofcapture.poses import Float64, invert, rotation_angle, transform, transform_points
 from tofcapture.rig import Rig
 
 NOTE, RETAKE, REFUSE = "note", "retake", "refuse"
@@ -181,49 +182,79 @@ def _flicker(raw: NDArray[Any]) -> float:
 SECTORS = ("right", "lower right", "below", "lower left", "left", "upper left", "above", "upper right")
 TILTS = (0.0, 8.0, 15.0, 25.0, 40.0, 90.0)  # deg
 TILTED = 8.0  # deg; a board less tilted leans in no direction
-RADIUS = 0.2  # m, of the disc that stands for the board
 CELLS = (9, 12)  # of the image
+_TURN = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+DISC = 0.2 * np.column_stack(
+    [np.cos(_TURN), np.sin(_TURN)]
+)  # m; the outline that stands for the board's while recording
 
 
-def lean_of(T_base_tof: Float64, normal: Float64) -> Float64:
-    """Find how the normal (3,) of the board's front leans in the image of poses (..., 4, 4): (..., 2), x right and y down.
+def board_pose(centre: Float64, normal: Float64) -> Float64:
+    """Build ``T_base_board`` (4, 4) of a board whose front has that normal (3,) and whose x is level.
 
-    The length is the sine of the tilt to the axis.
+    The turn in its plane does not matter for a tilt, and little for the image.
     """
-    return np.asarray(np.swapaxes(T_base_tof[..., :3, :2], -1, -2) @ normal, dtype=np.float64)
+    z = normal / np.linalg.norm(normal)
+    y = np.cross(z, [1.0, 0.0, 0.0])
+    y = y / np.linalg.norm(y) if np.linalg.norm(y) > 1e-6 else np.array([0.0, 1.0, 0.0])
+    return transform(np.stack([np.cross(y, z), y, z], axis=1), centre)
 
 
-def meter(poses: Sequence[Float64], board: Float64, normal: Float64, camera: Camera) -> str:
-    """Lay out tilts, directions, distances and the share of the image, in three lines.
+def coverage(poses: Sequence[Float64], camera: Camera, outline: Float64 = DISC) -> dict[str, Any]:
+    """Say what board views cover.
 
-    ``poses`` are ``T_base_tof`` (4, 4), ``board`` and ``normal`` (3,) centre and front of the board, base frame, metres.
+    The poses (4, 4) are ``T_tof_board``: the board's origin and, along its z, the normal of its front. The outline is (M, 2),
+    metres, or (N, M, 2), one for each view.
+
+    The answer is JSON: ``views``; ``tilt_deg`` (to the line of sight), ``lean_deg`` (of the normal in the image, x right, y down)
+    and ``distance_m`` of each view; ``tilt_histogram`` (counts between ``tilt_edges_deg``); ``sectors`` (counts by the direction
+    in which the front leans); ``image`` (9 x 12 counts) and ``image_share``.
     """
-    if not poses:
+    T = np.reshape(poses, (-1, 4, 4))
+    distance = np.linalg.norm(T[:, :3, 3], axis=1)
+    sight = -T[:, :3, 3] / np.maximum(distance, 1e-12)[:, None]
+    cosine = (T[:, :3, 2] * sight).sum(axis=1)
+    tilt = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    lean = T[:, :2, 2] - cosine[:, None] * sight[:, :2]
+    angle = np.degrees(np.arctan2(lean[:, 1], lean[:, 0]))
+    sector = np.round(angle[tilt >= TILTED] / 45.0).astype(int) % len(SECTORS)
+    outlines = np.broadcast_to(outline, (len(T), *np.shape(outline)[-2:]))
+    grid = sum((_seen(*each, camera) for each in zip(T, outlines, strict=True)), np.zeros(CELLS, dtype=int))
+    return {
+        "views": len(T),
+        "tilt_deg": tilt.tolist(),
+        "lean_deg": angle.tolist(),
+        "distance_m": distance.tolist(),
+        "tilt_edges_deg": list(TILTS),
+        "tilt_histogram": np.histogram(tilt, TILTS)[0].tolist(),
+        "sectors": dict(zip(SECTORS, np.bincount(sector, minlength=len(SECTORS)).tolist(), strict=True)),
+        "image": grid.tolist(),
+        "image_share": float((grid > 0).mean()),
+    }
+
+
+def meter(found: dict[str, Any]) -> str:
+    """Lay out tilts, directions, distances and the share of the image of a coverage, in three lines."""
+    if not found["views"]:
         return "no board views yet"
-    T = np.stack(poses)
-    gap = T[:, :3, 3] - board
-    distance = np.linalg.norm(gap, axis=1)
-    normal = normal / np.linalg.norm(normal)
-    tilt = np.degrees(np.arccos(np.clip(gap @ normal / distance, -1.0, 1.0)))
-    lean = lean_of(T, normal)[tilt >= TILTED]
-    sector = np.round(np.arctan2(lean[:, 1], lean[:, 0]) / (np.pi / 4)).astype(int) % 8
-    faces = [f"{name} {count}" for name, count in zip(SECTORS, np.bincount(sector, minlength=8), strict=True)]
-    counts = np.histogram(tilt, TILTS)[0]
-    tilts = [f"{a:g}-{b:g} deg {n}" for a, b, n in zip(TILTS[:-1], TILTS[1:], counts, strict=True)]
-    share = np.any([_seen(pose, board, normal, camera) for pose in poses], axis=0).mean()
-    far = f"{distance.min():.2f} to {distance.max():.2f} m"
-    title = f"{len(poses)} board views, {far}, image {100 * share:.0f} % covered"
-    return f"{title}\n  tilts  {'  '.join(tilts)}\n  faces  {'  '.join(faces)}"
+    far, edges = found["distance_m"], found["tilt_edges_deg"]
+    tilts = zip(edges[:-1], edges[1:], found["tilt_histogram"], strict=True)
+    share = f"image {100 * found['image_share']:.0f} % covered"
+    return "\n".join(
+        [
+            f"{found['views']} board views, {min(far):.2f} to {max(far):.2f} m, {share}",
+            f"  tilts  {'  '.join(f'{a:g}-{b:g} deg {n}' for a, b, n in tilts)}",
+            f"  faces  {'  '.join(f'{name} {n}' for name, n in found['sectors'].items())}",
+        ]
+    )
 
 
-def _seen(T_base_tof: Float64, board: Float64, normal: Float64, camera: Camera) -> Float64:
-    """Which cells of the image (9, 12) look at the board's disc."""
+def _seen(T_tof_board: Float64, outline: Float64, camera: Camera) -> NDArray[np.int64]:
+    """Which cells of the image (9, 12) have their centre on the board, as 0 and 1."""
+    corners = np.column_stack([outline, np.zeros(len(outline))])
+    pixels, depth = camera.project(transform_points(T_tof_board, corners))
+    if not (depth > 0).all():
+        return np.zeros(CELLS, dtype=np.int64)
     v = (np.arange(CELLS[0]) + 0.5) * camera.height / CELLS[0] - 0.5
     u = (np.arange(CELLS[1]) + 0.5) * camera.width / CELLS[1] - 0.5
-    rays = camera.rays_at(np.stack(np.meshgrid(u, v), axis=-1))
-    T_board_tof = invert(look_at(board, board + normal)) @ T_base_tof
-    way, eye = rays @ T_board_tof[:3, :3].T, T_board_tof[:3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reach = -eye[2] / way[..., 2]
-        met = transform_points(T_board_tof, rays * reach[..., None])
-    return np.asarray((reach > 0) & (np.hypot(met[..., 0], met[..., 1]) < RADIUS))
+    return inside(pixels, np.stack(np.meshgrid(u, v), axis=-1)).astype(np.int64)
