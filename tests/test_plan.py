@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofcapture.camera import Camera
-from tofcapture.devices.clearance import is_clear, obstacles, route, stage_of
+from tofcapture.devices.clearance import is_clear, obstacles, route, workcell_of
 from tofcapture.devices.kinematics import HOME, MODELS, forward
 from tofcapture.devices.station import read_station
 from tofcapture.errors import ConfigError, MotionRefused
@@ -23,13 +23,13 @@ RIG = Rig(
     T_tof_stereo=transform(rotation_exp([0.04, 0.01, 0.0]), [-0.05, 0.08, 0.0]),
     T_flange_tof=transform(rotation_exp([0.01, -0.02, 0.02]), [0.0, -0.035, 0.08]),
 )
-STAGE = stage_of(read_station(None))
+STAGE = workcell_of(read_station(None))
 
 
-def _plan(views=25, seed=0, model=UR10E, stage=STAGE, sampling=None, target=None):
+def _plan(views=25, seed=0, model=UR10E, workcell=STAGE, sampling=None, target=None):
     sampling = replace(sampling or object_sampling(), directions=160)
-    target = stage.target if target is None else target
-    return plan_views(model, RIG, stage, target, sampling, views, np.random.default_rng(seed))
+    target = workcell.target if target is None else target
+    return plan_views(model, RIG, workcell, target, sampling, views, np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_board_views_tilt_in_all_directions(seed):
 )
 def test_nothing_reachable_is_reported(reason, change, least):
     """A target beyond the arm, and a table as high as the camera, leave no view, and the plan says which stands against them."""
-    plan = _plan(stage=replace(STAGE, **change))
+    plan = _plan(workcell=replace(STAGE, **change))
     assert plan.views == ()
     assert plan.refused[reason] >= least * plan.candidates
     assert "0 of 25 views" in plan.summary()
@@ -181,10 +181,10 @@ def test_wrong_stage_is_refused(change, message):
     """Wrong shapes, unknown keys and words in [plan] are refused by name."""
     config = read_station(None)
     with pytest.raises(ConfigError, match=message):
-        stage_of({"plan": {**config["plan"], **change}})
+        workcell_of({"plan": {**config["plan"], **change}})
 
 
 def test_missing_stage_is_refused():
     """A station without [plan] cannot be planned for."""
     with pytest.raises(ConfigError, match="plan"):
-        stage_of({})
+        workcell_of({})

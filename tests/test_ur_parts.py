@@ -17,7 +17,7 @@ from tests.ur_emulator.robot import PLAYING, Robot
 from tests.ur_emulator.rtde_server import pack
 from tests.ur_emulator.script import ControlScript
 from tofcapture.devices import faults
-from tofcapture.devices.clearance import body_points, stage_of
+from tofcapture.devices.clearance import body_points, workcell_of
 from tofcapture.devices.kinematics import HOME
 from tofcapture.devices.station import DEFAULT, open_station
 from tofcapture.devices.ur_rtde import link as wire
@@ -132,7 +132,7 @@ def test_goals_are_checked(joints, pattern):
 def test_ways_are_checked():
     """The free way passes; a workspace, a keep-out box and the table stop it, even when only the way is blocked."""
     config = tomllib.loads(DEFAULT.read_text())
-    stage = stage_of(config)
+    stage = workcell_of(config)
     with open_station() as station:
         rig = station.rig
     goal = _turned(1, 0.3)

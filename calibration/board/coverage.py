@@ -15,7 +15,7 @@ from calibration.limits import LIMITS
 from calibration.registration.pairs import calibration_views
 from tofcapture.camera import Camera
 from tofcapture.cli.kit import Outcome
-from tofcapture.devices.clearance import stage_of
+from tofcapture.devices.clearance import workcell_of
 from tofcapture.errors import DataError
 from tofcapture.files.view import read_view
 from tofcapture.poses import Float64, invert
@@ -73,12 +73,12 @@ def recorded_poses(recording: Path) -> tuple[list[Float64], Camera]:
     """
     path = Path(recording) / "station.toml"
     try:
-        stage = stage_of(tomllib.loads(path.read_text(encoding="utf-8")))
+        workcell = workcell_of(tomllib.loads(path.read_text(encoding="utf-8")))
     except (OSError, tomllib.TOMLDecodeError) as err:
         raise DataError(
             f"{path}: cannot read where the board stands: {err}", hint="record writes it beside the views"
         ) from err
-    T_base_board, poses = board_pose(stage.board, stage.board_normal), []
+    T_base_board, poses = board_pose(workcell.board, workcell.board_normal), []
     for view in map(read_view, calibration_views(recording)):
         poses.append(invert(view.arm_before.T_base_flange @ view.rig.T_flange_tof) @ T_base_board)
         camera = view.tof.info.camera

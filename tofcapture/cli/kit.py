@@ -1,4 +1,4 @@
-"""What every command shares: what a command is, progress with the time left, tables of a fixed form, results as JSON files.
+"""Define what every command shares: what a command is, progress with the time left, tables of a fixed form, results as JSON files.
 
 Every package adds its commands through the entry-point group ``tofcapture.commands``. Each entry point names one :class:`Command`.
 Its module is light to import: heavy libraries are imported inside ``run``.
@@ -19,7 +19,7 @@ from typing import Any, Protocol
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command hands back."""
+    """Hold what a command hands back."""
 
     #: JSON-serialisable result, printed as one object on stdout under ``--json``.
     data: dict[str, Any] = field(default_factory=dict)

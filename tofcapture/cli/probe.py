@@ -1,4 +1,4 @@
-"""What the doctor looks at in processes of their own, because it may hang, crash or take long.
+"""Define what the doctor looks at in processes of their own, because it may hang, crash or take long.
 
 ``python -m tofcapture.cli.probe NAME [ARGUMENT]`` is such a process; it prints findings as one JSON list.
 """
@@ -154,14 +154,14 @@ def probe_commands() -> Iterator[Finding]:
 
 def probe_station(path: str, opening: str = "") -> Iterator[Finding]:
     """Read a station's file, make its drivers, ask whether its devices are there; with ``opening`` open them too."""
-    from tofcapture.devices.clearance import stage_of
+    from tofcapture.devices.clearance import workcell_of
     from tofcapture.devices.registry import ROLES, StationContext
     from tofcapture.devices.station import open_station, read_station
 
     file = Path(path) if path else None
     try:
         config = read_station(file)
-        stage_of(config)
+        workcell_of(config)
     except TofError as err:
         yield Finding("station", "FAIL", err.message, err.hint)
         return

@@ -87,14 +87,14 @@ class _BoardMeter(Observer):
 
     def sealed(self, view: View, sha256: str) -> None:
         """Print the meter."""
-        from tofcapture.devices.clearance import stage_of
+        from tofcapture.devices.clearance import workcell_of
         from tofcapture.poses import invert
         from tofcapture.record.quality import board_pose, coverage, meter
 
         del sha256
         self._there.append(view.index)
-        stage, camera = stage_of(self._station.config), self._station.rig.tof
-        T_base_board = board_pose(stage.board, stage.board_normal)
+        workcell, camera = workcell_of(self._station.config), self._station.rig.tof
+        T_base_board = board_pose(workcell.board, workcell.board_normal)
         found = coverage([invert(self._poses[i]) @ T_base_board for i in self._there], camera)
         print(meter(found), file=sys.stderr, flush=True)
 
@@ -115,15 +115,15 @@ def _handed_over(args: argparse.Namespace, scene: str, views: int) -> Outcome | 
 
 def _planned(args: argparse.Namespace, scene: str, station: Station, plan: Plan) -> Outcome:
     """Print the plan, draw it."""
-    from tofcapture.devices.clearance import stage_of
+    from tofcapture.devices.clearance import workcell_of
     from tofcapture.viz.plan import write_plan
 
-    stage = stage_of(station.config)
+    workcell = workcell_of(station.config)
     picture = args.picture or args.out.parent / f"{args.out.name}-{scene}-plan.svg"
-    target = stage.board if args.calibration else stage.target
+    target = workcell.board if args.calibration else workcell.target
     title = f"{scene}: {len(plan.views)} views, {station.arm.describe().model}"
     picture.parent.mkdir(parents=True, exist_ok=True)
-    write_plan(plan, stage, station.rig, target, title, picture)
+    write_plan(plan, workcell, station.rig, target, title, picture)
     return Outcome(
         data={"ok": True, "scene": scene, "plan": plan.as_json(), "picture": str(picture)},
         text="\n".join([plan.summary(), _plan_table(plan), *plan.shortfall(), f"drawn in {picture}"]),

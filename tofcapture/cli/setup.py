@@ -1,4 +1,4 @@
-"""What an installation holds: ``tofcapture config`` and ``completion``, the station in use, the bundled weights."""
+"""Define what an installation holds: ``tofcapture config`` and ``completion``, the station in use, the bundled weights."""
 
 from __future__ import annotations
 

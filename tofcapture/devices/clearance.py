@@ -32,7 +32,7 @@ REASONS = ("table", "object", "base", "self")
 
 
 @dataclass(frozen=True)
-class Stage:
+class Workcell:
     """Places of table, object and board, in the base frame, metres."""
 
     table: float  # height of the table top
@@ -44,14 +44,14 @@ class Stage:
     home: Float64 = field(default_factory=HOME.copy)  # (6,) rad; from there every view is reached
 
 
-def stage_of(config: Mapping[str, Any]) -> Stage:
+def workcell_of(config: Mapping[str, Any]) -> Workcell:
     """Read the ``[plan]`` table of a station; raises ConfigError unless all of it are finite numbers of known names."""
     table = config.get("plan")
     if table is None:
         raise ConfigError("station: expected a table [plan] that says where the table and the object stand")
     try:
         values = {key: np.asarray(value, dtype=np.float64) for key, value in table.items()}
-        stage = Stage(**{key: v if v.ndim else float(v) for key, v in values.items()})  # type: ignore[arg-type]
+        workcell = Workcell(**{key: v if v.ndim else float(v) for key, v in values.items()})  # type: ignore[arg-type]
     except (TypeError, ValueError) as err:
         raise ConfigError(
             f"station: [plan]: {err}", hint="see the comments of the embedded station.toml"
@@ -62,7 +62,7 @@ def stage_of(config: Mapping[str, Any]) -> Stage:
             raise ConfigError(
                 f"station: [plan] {key}: expected {f'{shape[0]} finite numbers' if shape else 'a finite number'}, got {v.tolist()}"
             )
-    return stage
+    return workcell
 
 
 def body_points(model: ArmModel, rig: Rig, joints: NDArray[np.floating]) -> tuple[Float64, Float64]:
@@ -81,7 +81,9 @@ def body_points(model: ArmModel, rig: Rig, joints: NDArray[np.floating]) -> tupl
     return links.reshape(*links.shape[:-3], links.shape[-3] * len(_SAMPLES), 3), tools
 
 
-def obstacles(model: ArmModel, rig: Rig, stage: Stage, joints: NDArray[np.floating]) -> NDArray[np.bool_]:
+def obstacles(
+    model: ArmModel, rig: Rig, workcell: Workcell, joints: NDArray[np.floating]
+) -> NDArray[np.bool_]:
     """Say what is in the way at joint angles (..., 6), radians; returns (..., 4), one per entry of :data:`REASONS`."""
     links, tools = body_points(model, rig, joints)
     cameras = tools[..., 1:, :]
@@ -89,8 +91,8 @@ def obstacles(model: ArmModel, rig: Rig, stage: Stage, joints: NDArray[np.floati
     wrist = np.concatenate([origins[..., 3:, :], cameras], axis=-2)
     return np.stack(
         [
-            _low(links, stage, _LINK) | _low(cameras, stage, _BLOCK),
-            _inside(links, stage, _LINK) | _inside(cameras, stage, _BLOCK),
+            _low(links, workcell, _LINK) | _low(cameras, workcell, _BLOCK),
+            _inside(links, workcell, _LINK) | _inside(cameras, workcell, _BLOCK),
             (np.linalg.norm(tools[..., :2], axis=-1) < _COLUMN).any(axis=-1),
             (_to_segment(wrist, origins[..., 0, :], origins[..., 1, :]) < 2 * _LINK).any(axis=-1)
             | (_to_segment(cameras, origins[..., 1, :], origins[..., 2, :]) < _LINK + _BLOCK).any(axis=-1),
@@ -99,16 +101,16 @@ def obstacles(model: ArmModel, rig: Rig, stage: Stage, joints: NDArray[np.floati
     )
 
 
-def _low(points: Float64, stage: Stage, radius: float) -> NDArray[np.bool_]:
+def _low(points: Float64, workcell: Workcell, radius: float) -> NDArray[np.bool_]:
     """Any of the points (..., N, 3) too close above the table."""
-    out: NDArray[np.bool_] = np.any(points[..., 2] < stage.table + radius + _TABLE_MARGIN, axis=-1)
+    out: NDArray[np.bool_] = np.any(points[..., 2] < workcell.table + radius + _TABLE_MARGIN, axis=-1)
     return out
 
 
-def _inside(points: Float64, stage: Stage, radius: float) -> NDArray[np.bool_]:
+def _inside(points: Float64, workcell: Workcell, radius: float) -> NDArray[np.bool_]:
     """Any of the points (..., N, 3) inside the keep-out cylinder grown by a radius."""
-    aside = np.linalg.norm(points[..., :2] - stage.target[:2], axis=-1) < stage.keep_out_radius + radius
-    below = points[..., 2] < stage.table + stage.keep_out_height + radius
+    aside = np.linalg.norm(points[..., :2] - workcell.target[:2], axis=-1) < workcell.keep_out_radius + radius
+    below = points[..., 2] < workcell.table + workcell.keep_out_height + radius
     out: NDArray[np.bool_] = np.any(aside & below, axis=-1)
     return out
 
@@ -129,18 +131,18 @@ def straight_way(start: Float64, goal: Float64, step: float) -> Float64:
     return way
 
 
-def is_clear(model: ArmModel, rig: Rig, stage: Stage, start: Float64, goal: Float64) -> bool:
+def is_clear(model: ArmModel, rig: Rig, workcell: Workcell, start: Float64, goal: Float64) -> bool:
     """Tell whether the straight way in joint space from (6,) to (6,) meets nothing."""
-    return not obstacles(model, rig, stage, straight_way(start, goal, _STEP)).any()
+    return not obstacles(model, rig, workcell, straight_way(start, goal, _STEP)).any()
 
 
-def route(model: ArmModel, rig: Rig, stage: Stage, start: Float64, goal: Float64) -> list[Float64]:
+def route(model: ArmModel, rig: Rig, workcell: Workcell, start: Float64, goal: Float64) -> list[Float64]:
     """Goals (6,) to visit one after the other: straight if nothing is in the way, else by way of home.
 
     Raises MotionRefused when neither way is clear.
     """
-    for way in ([goal], [stage.home, goal]):
-        if all(is_clear(model, rig, stage, a, b) for a, b in zip([start, *way], way, strict=False)):
+    for way in ([goal], [workcell.home, goal]):
+        if all(is_clear(model, rig, workcell, a, b) for a, b in zip([start, *way], way, strict=False)):
             return way
     raise MotionRefused(
         "no clear way to the next view, straight or by way of home",

@@ -43,7 +43,7 @@ ON CONFLICT DO UPDATE SET pose = excluded.pose, state = 'sealed', sha256 = exclu
 
 @dataclass(frozen=True)
 class JournalRow:
-    """What the journal says of one view."""
+    """Hold what the journal says of one view."""
 
     scene: str
     index: int

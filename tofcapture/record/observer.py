@@ -1,4 +1,4 @@
-"""Who looks on while the recorder works, and may make it wait or end."""
+"""Define who looks on while the recorder works, and may make it wait or end."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices.clearance import REASONS, Stage, is_clear, obstacles, stage_of
+from tofcapture.devices.clearance import REASONS, Workcell, is_clear, obstacles, workcell_of
 from tofcapture.devices.kinematics import ArmModel, arm_model, forward, inverse_all, wrap
 from tofcapture.devices.station import Station
 from tofcapture.errors import ConfigError
@@ -82,7 +82,7 @@ class PlannedView:
 
 @dataclass(frozen=True)
 class Tried:
-    """What became of the candidates."""
+    """Hold what became of the candidates."""
 
     spots: Float64  # (C, 3) where the ToF camera would stand, base frame, metres
     refusal: NDArray[np.int8]  # (C,) index into REFUSALS, -1 where nothing stands against it
@@ -135,7 +135,7 @@ def plan_scene(station: Station, scene: str, views: int, turns: int = 1) -> Plan
     check_scene_name(scene)
     if views < 1:
         raise ConfigError(f"views: expected at least 1, got {views}")
-    stage, board = stage_of(station.config), scene == CALIBRATION
+    workcell, board = workcell_of(station.config), scene == CALIBRATION
     if not 1 <= turns <= (1 if board else _MOST_TURNS):
         limit = "the board stays as it stands" if board else f"expected 1 to {_MOST_TURNS}"
         raise ConfigError(f"turns: {limit}, got {turns}")
@@ -143,9 +143,9 @@ def plan_scene(station: Station, scene: str, views: int, turns: int = 1) -> Plan
     plan = plan_views(
         arm_model(station.arm.describe().model),
         station.rig,
-        stage,
-        stage.board if board else stage.target,
-        board_sampling(stage) if board else object_sampling(),
+        workcell,
+        workcell.board if board else workcell.target,
+        board_sampling(workcell) if board else object_sampling(),
         views,
         np.random.default_rng(np.frombuffer(digest, dtype="<u4").tolist()),
         turns,
@@ -161,7 +161,7 @@ def plan_scene(station: Station, scene: str, views: int, turns: int = 1) -> Plan
 def plan_views(
     model: ArmModel,
     rig: Rig,
-    stage: Stage,
+    workcell: Workcell,
     target: Float64,
     sampling: Sampling,
     views: int,
@@ -175,7 +175,7 @@ def plan_views(
     """
     directions, distances = candidates(sampling, rng)
     T_base_flange = flange_poses(rig, target, sampling, directions, distances, rng)
-    joints, refusal = hold_poses(model, rig, stage, T_base_flange)
+    joints, refusal = hold_poses(model, rig, workcell, T_base_flange)
     count = len(joints)
     angles = 2 * np.pi * np.arange(turns) / turns
     seen = np.concatenate([rotate_vectors(_about_vertical(-angle), directions) for angle in angles])
@@ -185,7 +185,7 @@ def plan_views(
         features = np.column_stack([features, np.tile(lean, (turns, 1))])
 
     def accept(k: int) -> bool:
-        clear = is_clear(model, rig, stage, stage.home, joints[k % count])
+        clear = is_clear(model, rig, workcell, workcell.home, joints[k % count])
         if not clear:
             refusal[k % count] = REFUSALS.index("way from home")
         return clear
@@ -197,12 +197,12 @@ def plan_views(
     ]
     refused = {reason: int((refusal == i).sum()) for i, reason in enumerate(REFUSALS)}
     tried = Tried(target + distances[:, None] * directions, refusal)
-    return Plan(tuple(_by_travel(planned, stage.home)), views, count, refused, tried)
+    return Plan(tuple(_by_travel(planned, workcell.home)), views, count, refused, tried)
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Where candidates lie; lengths in metres, angles in radians."""
+    """Tell where candidates lie; lengths in metres, angles in radians."""
 
     axis: Float64  # (3,) direction from the target about which views are spread
     tilt: tuple[float, float] = (0.0, float(np.radians(65.0)))  # smallest and largest angle to the axis
@@ -218,13 +218,13 @@ def object_sampling() -> Sampling:
     return Sampling(axis=np.array([0.0, 0.0, 1.0]))
 
 
-def board_sampling(stage: Stage) -> Sampling:
+def board_sampling(workcell: Workcell) -> Sampling:
     """Sample tilts of 15 to 40 deg to the board's normal in all directions, 0.5 to 1 m away.
 
     Each candidate has one random roll. The roll nearest to home would lean the board the same way in most images.
     """
     tilt, distances = (float(np.radians(15.0)), float(np.radians(40.0))), (0.5, 0.6, 0.72, 0.85, 1.0)
-    return Sampling(stage.board_normal, tilt, distances, aim=0.04, directions=240, rolls=1, lean=0.5)
+    return Sampling(workcell.board_normal, tilt, distances, aim=0.04, directions=240, rolls=1, lean=0.5)
 
 
 def candidates(sampling: Sampling, rng: np.random.Generator) -> tuple[Float64, Float64]:
@@ -271,20 +271,20 @@ def leans(rig: Rig, axis: Float64, T_base_flange: Float64) -> Float64:
 
 
 def hold_poses(
-    model: ArmModel, rig: Rig, stage: Stage, T_base_flange: Float64
+    model: ArmModel, rig: Rig, workcell: Workcell, T_base_flange: Float64
 ) -> tuple[Float64, NDArray[np.int8]]:
     """Find joints (C, 6), nearest to home, that hold flange poses (C, rolls, 4, 4) and meet nothing; NaN: there are none.
 
     With them come refusals (C,): indices into :data:`REFUSALS` of what stood in the way, -1 for nothing.
     """
     count = len(T_base_flange)
-    q = stage.home + wrap(inverse_all(model, T_base_flange) - stage.home)
+    q = workcell.home + wrap(inverse_all(model, T_base_flange) - workcell.home)
     q = q.reshape(count, -1, 6)
     reached: Bools = np.all(np.abs(q) <= model.limit, axis=-1)  # NaN is not
     hits = np.zeros((*reached.shape, len(REASONS)), dtype=bool)
-    hits[reached] = obstacles(model, rig, stage, q[reached])
+    hits[reached] = obstacles(model, rig, workcell, q[reached])
     clear: Bools = reached & ~np.any(hits, axis=-1)
-    cost = np.where(clear, (JOINT_WEIGHTS * np.nan_to_num(q - stage.home) ** 2).sum(axis=-1), np.inf)
+    cost = np.where(clear, (JOINT_WEIGHTS * np.nan_to_num(q - workcell.home) ** 2).sum(axis=-1), np.inf)
     best = q[np.arange(count), cost.argmin(axis=1)]
     lost: Bools = ~np.any(clear, axis=1)
     # Rounded to a millionth, goals are the same on machines whose last bits differ.

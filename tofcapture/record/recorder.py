@@ -13,7 +13,7 @@ import numpy as np
 import tomli_w
 
 from tofcapture import __version__
-from tofcapture.devices.clearance import route, stage_of
+from tofcapture.devices.clearance import route, workcell_of
 from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.station import Station
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
@@ -34,7 +34,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class RecordResult:
-    """What a run of the recorder did: numbers of views, and sentences."""
+    """Hold what a run of the recorder did: numbers of views, and sentences."""
 
     scene: str
     recorded: tuple[int, ...]  # taken now
@@ -173,9 +173,9 @@ class _Run:
     def move(self, planned: PlannedView) -> ArmState:
         """Move by a clear way; the arm returns settled."""
         self.begin(planned.index, "moving")
-        model, stage = arm_model(self.station.arm.describe().model), stage_of(self.station.config)
+        model, workcell = arm_model(self.station.arm.describe().model), workcell_of(self.station.config)
         state = self.station.arm.state()
-        for joints in route(model, self.station.rig, stage, state.joints, planned.joints):
+        for joints in route(model, self.station.rig, workcell, state.joints, planned.joints):
             state = self.station.arm.move_to(joints)
         return state
 

@@ -1,4 +1,4 @@
-"""What a recorder needs before it starts: room on the disk, its recording, its arm, leave to move it."""
+"""Define what a recorder needs before it starts: room on the disk, its recording, its arm, leave to move it."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tofcapture import __version__
-from tofcapture.devices.clearance import stage_of
+from tofcapture.devices.clearance import workcell_of
 from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.sim import VERSION
@@ -131,9 +131,11 @@ def _by_arm(job: Job, world: SimWorld) -> Iterator[tuple[int, ArmState, SimClock
     config = read_station(None)
     model = arm_model(config["arm"]["model"])
     context = StationContext(config=config, folder=Path(), shared={"sim": world})
-    stage = stage_of(config)
+    workcell = workcell_of(config)
     rng = generator(job.scene.plan_name, job.seed, "suite plan")
-    plan = plan_views(model, world.nominal_rig(), stage, stage.target, object_sampling(), job.views, rng)
+    plan = plan_views(
+        model, world.nominal_rig(), workcell, workcell.target, object_sampling(), job.views, rng
+    )
     with SimArm({"model": config["arm"]["model"]}, context) as arm:
         for planned in plan.views:
             yield planned.index, arm.move_to(planned.joints), shared_clock(context)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tofcapture.devices.clearance import Stage
+from tofcapture.devices.clearance import Workcell
 from tofcapture.files.seal import write_text
 from tofcapture.poses import Float64, transform_points
 from tofcapture.record.plan import REMEDIES, Plan, PlannedView
@@ -23,12 +23,12 @@ _REASONS = ("#9aa0a6", "#b5651d", "#d93025", "#7b1fa2", "#c2185b", "#5f6368", "#
 _SIDES = (((0, 1), "from above"), ((0, 2), "from the side"))
 
 
-def write_plan(plan: Plan, stage: Stage, rig: Rig, target: Float64, title: str, out: Path) -> None:
+def write_plan(plan: Plan, workcell: Workcell, rig: Rig, target: Float64, title: str, out: Path) -> None:
     """Draw a plan as SVG: from above (x, y) and from the side (x, z) in the base frame, at one scale.
 
     The views look at ``target`` (3,), base frame, metres. The file is replaced when it exists.
     """
-    low, high = _bounds(plan, stage, rig, target)
+    low, high = _bounds(plan, workcell, rig, target)
     middle, reach = (low + high) / 2, float((high - low).max()) / 2
     turns = sorted({view.turn for view in plan.views})
     colours = {turn: LINES[n % len(LINES)] for n, turn in enumerate(turns)}
@@ -45,7 +45,7 @@ def write_plan(plan: Plan, stage: Stage, rig: Rig, target: Float64, title: str, 
             axes.set_ylabel(f"{'xyz'[shown[1]]} (m)")
             axes.grid(alpha=0.3)
             _draw_refused(axes, plan, shown)
-            (_draw_above if column == 0 else _draw_side)(axes, stage)
+            (_draw_above if column == 0 else _draw_side)(axes, workcell)
             axes.plot(*target[shown], "+", color=_RED, ms=11, mew=2)
             if plan.views:
                 way = np.stack([_pose(view, rig)[:3, 3] for view in plan.views])
@@ -60,33 +60,37 @@ def _pose(view: PlannedView, rig: Rig) -> Float64:
     return view.T_base_flange @ rig.T_flange_tof
 
 
-def _bounds(plan: Plan, stage: Stage, rig: Rig, target: Float64) -> tuple[Float64, Float64]:
+def _bounds(plan: Plan, workcell: Workcell, rig: Rig, target: Float64) -> tuple[Float64, Float64]:
     """Corners (3,) of what is drawn."""
-    points = [np.zeros((1, 3)), target[None], np.array([[*target[:2], stage.table]])]
+    points = [np.zeros((1, 3)), target[None], np.array([[*target[:2], workcell.table]])]
     points += [_pose(view, rig)[None, :3, 3] for view in plan.views]
     points += [] if plan.tried is None else [plan.tried.spots]
     every = np.concatenate(points)
     return every.min(axis=0) - 0.15, every.max(axis=0) + 0.15
 
 
-def _draw_above(axes: Any, stage: Stage) -> None:
+def _draw_above(axes: Any, workcell: Workcell) -> None:
     from matplotlib.patches import Circle
 
-    axes.add_patch(Circle((stage.target[0], stage.target[1]), stage.keep_out_radius, fc=_PINK, ec=_RED))
+    axes.add_patch(
+        Circle((workcell.target[0], workcell.target[1]), workcell.keep_out_radius, fc=_PINK, ec=_RED)
+    )
     axes.add_patch(Circle((0, 0), _COLUMN, fc="#e8eaed", ec=_GREY))
     axes.text(0, 0, "base", ha="center", va="center")
 
 
-def _draw_side(axes: Any, stage: Stage) -> None:
+def _draw_side(axes: Any, workcell: Workcell) -> None:
     from matplotlib.patches import Rectangle
 
-    r = stage.keep_out_radius
-    keep_out = Rectangle((stage.target[0] - r, stage.table), 2 * r, stage.keep_out_height, fc=_PINK, ec=_RED)
+    r = workcell.keep_out_radius
+    keep_out = Rectangle(
+        (workcell.target[0] - r, workcell.table), 2 * r, workcell.keep_out_height, fc=_PINK, ec=_RED
+    )
     axes.add_patch(keep_out)
     axes.add_patch(Rectangle((-_COLUMN, -0.02), 2 * _COLUMN, 0.04, fc="#e8eaed", ec=_GREY))
     axes.text(0, 0.03, "base", ha="center")
-    axes.axhline(stage.table, color="#795548", lw=2.5)
-    axes.text(axes.get_xlim()[0], stage.table, " table", va="top")
+    axes.axhline(workcell.table, color="#795548", lw=2.5)
+    axes.text(axes.get_xlim()[0], workcell.table, " table", va="top")
 
 
 def _draw_refused(axes: Any, plan: Plan, shown: list[int]) -> None:

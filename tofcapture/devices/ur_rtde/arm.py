@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from tofcapture.devices import Arm
-from tofcapture.devices.clearance import stage_of
+from tofcapture.devices.clearance import workcell_of
 from tofcapture.devices.faults import ArmFault, NotReady
 from tofcapture.devices.kinematics import forward
 from tofcapture.devices.ur_rtde.limits import (
@@ -225,7 +225,7 @@ class UrArm(Arm):
         if self._rig is None:
             raise MotionRefused("the arm does not know what it carries", hint="open it as part of a station")
         goal = check_goal(self._settings, start.joints, joints)
-        check_way(self._settings, self._rig, stage_of(self._context.config), start.joints, goal)
+        check_way(self._settings, self._rig, workcell_of(self._context.config), start.joints, goal)
         if self._limits_known and not self._within(goal):
             raise MotionRefused("move: the controller's safety limits refuse the goal")
         return goal

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofcapture.devices.clearance import Stage, body_points, is_clear, straight_way
+from tofcapture.devices.clearance import Workcell, body_points, is_clear, straight_way
 from tofcapture.devices.faults import NotSettled, ProgramStopped
 from tofcapture.devices.kinematics import ArmModel, arm_model, check_joints
 from tofcapture.devices.registry import check_keys
@@ -111,7 +111,7 @@ def check_goal(settings: Settings, start: Float64, joints: ArrayLike) -> Float64
     return goal
 
 
-def check_way(settings: Settings, rig: Rig, stage: Stage, start: Float64, goal: Float64) -> None:
+def check_way(settings: Settings, rig: Rig, workcell: Workcell, start: Float64, goal: Float64) -> None:
     """Go along the straight way in joint space and look for what is in the way.
 
     Raises
@@ -128,7 +128,7 @@ def check_way(settings: Settings, rig: Rig, stage: Stage, start: Float64, goal: 
     for number, (low, high) in enumerate(settings.keep_out):
         if ((body > low - _RADIUS) & (body < high + _RADIUS)).all(axis=-1).any():
             raise MotionRefused(f"move: the way goes through [arm] keep_out {number + 1}")
-    if not is_clear(settings.model, rig, stage, start, goal):
+    if not is_clear(settings.model, rig, workcell, start, goal):
         raise MotionRefused(
             "move: table, object, base or the arm itself is in the way",
             hint="go by way of home; check table, target and keep_out of [plan]",

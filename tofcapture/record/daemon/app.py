@@ -143,7 +143,7 @@ def _job_number(text: str) -> int:
 
 
 class Api:
-    """What one daemon does for each route."""
+    """Hold what one daemon does for each route."""
 
     def __init__(self, supervisor: Supervisor, streams: Streams, guard: Guard) -> None:
         self._do, self._streams, self._guard = supervisor, streams, guard
@@ -216,7 +216,7 @@ class Api:
 
     @route("GET", _STREAM, "text/event-stream", 400, 503)
     def events(self) -> None:
-        """What happens, as server-sent events, without end."""
+        """Tell what happens, as server-sent events, without end."""
 
     @route("GET", "/v1/preview/{name}", "image/png")
     def preview(self, name: str) -> web.Response:
@@ -228,7 +228,7 @@ class Api:
 
     @route("GET", "/v1/page", "Page")
     def page(self) -> Schema:
-        """Where the page is, token included; null without TCP."""
+        """Tell where the page is, token included; null without TCP."""
         return {"url": self.page_url}
 
     @route("GET", "/openapi.json", "Document")

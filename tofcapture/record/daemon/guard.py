@@ -1,4 +1,4 @@
-"""Who may ask, and how slowly: everything that is decided before a request is looked at.
+"""Define who may ask, and how slowly: everything that is decided before a request is looked at.
 
 Over the Unix socket: this user (or root), known from the kernel. Over TCP: a Host that is ours (no DNS rebinding), no foreign
 Origin, and the token. Over both: verbs need a header that no foreign page can send, and JSON that says so.

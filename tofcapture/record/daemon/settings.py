@@ -1,4 +1,4 @@
-"""What the daemon is started with, and its own folder: queue, token, socket, lock, previews."""
+"""Define what the daemon is started with, and its own folder: queue, token, socket, lock, previews."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class StateFolder:
 
 @dataclass(frozen=True)
 class Settings:
-    """What the daemon was started with."""
+    """Hold what the daemon was started with."""
 
     root: Path  # of recordings; a job names a folder in it
     state: StateFolder

@@ -1,4 +1,4 @@
-"""What the daemon must not forget: its queue and what happened. SQLite; a call returns when all is on disk.
+"""Define what the daemon must not forget: its queue and what happened. SQLite; a call returns when all is on disk.
 
 Events go to every client from where it left off; a slow one is dropped, never waited for.
 """

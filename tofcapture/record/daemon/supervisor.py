@@ -89,7 +89,7 @@ class RecorderProcess:
 
 
 class Progress:
-    """How far the job in hand is, put together from what its recorder tells."""
+    """Tell how far the job in hand is, put together from what its recorder tells."""
 
     def __init__(self) -> None:
         self.job: int | None = None
