@@ -5,11 +5,11 @@
 A mutant is one change to one expression or statement of the three packages: a comparison, an operator, a number, an and/or, a
 condition, a dropped call. Lines are drawn evenly over the packages, and one place on each. First the default tests run once, in a copy of the tree, and it is noted which test
 executes which line, in its own process or in one that it starts. A mutant is tried on the tests that execute its line, then on the
-whole test files that execute any line of its file (what numba compiles has no other trace). A line that no test executes lives
-without a trial. The survivors are printed as diffs: whoever reads them judges which change no behaviour (a bound that is never met,
+whole test files that hold them. Where none is known (constants, what numba compiles), these are the files that execute any line of its file. A line that
+no test executes lives without a trial. The survivors are printed as diffs: whoever reads them judges which change no behaviour (a bound that is never met,
 a log line, a cache size), and says so beside the figure.
 
-Needs ``coverage``. ``--map`` keeps what the first run measured; it holds as long as the three packages stay as they are.
+Needs ``coverage``. ``--map`` keeps what the first run measured; of files that changed since, no line is known.
 """
 
 from __future__ import annotations
@@ -18,20 +18,24 @@ import argparse
 import ast
 import difflib
 import hashlib
+import importlib
 import json
+import multiprocessing
 import os
 import random
 import shutil
+import signal
 import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
 import pytest
@@ -39,7 +43,20 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("tofcapture", "calibration", "tofcapture_model")
 LEFT_OUT = shutil.ignore_patterns(".*", "build", "__pycache__")
-LIMIT = 900  # s for the tests of one mutant
+LIBRARIES = (
+    "torch",
+    "numba",
+    "cv2",
+    "h5py",
+    "scipy.optimize",
+    "scipy.ndimage",
+    "scipy.spatial",
+    "scipy.stats",
+    "matplotlib.figure",
+)
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")  # as the tests' conftest does; a fork may not inherit threads
+LIMIT = 900  # s of the clock for one helping of tests
 COMPARE = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
            ast.In: ast.NotIn, ast.NotIn: ast.In, ast.Is: ast.IsNot, ast.IsNot: ast.Is}  # fmt: skip
 OPERATE = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult,
@@ -106,31 +123,74 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 @dataclass(frozen=True)
 class Map:
-    """Which tests execute a line, how long each test takes, which ones fail anyway."""
+    """Which tests execute a line, how long each test takes, which ones fail without any mutant."""
 
-    digest: str
+    digests: dict[str, str]  # of the files as they were measured
     tests: dict[str, dict[int, set[str]]]  # path -> line -> tests; an import belongs to no test
     seconds: dict[str, float]
     failed: list[str]
 
-    def near(self, path: str, line: int) -> list[str]:
-        """List the tests that execute a line, file by file, the quickest first."""
-        known = self.tests.get(path, {}).get(line, set()) & self.seconds.keys()
-        return sorted(known, key=lambda t: (self._file(t), self.seconds[t]))
+    def knows(self, path: str) -> bool:
+        """Tell whether a file is as it was: of a changed one no line is known, and every test of it is run."""
+        return self.digests.get(path) == digest(path)
 
-    def far(self, path: str) -> list[str]:
-        """List the test files that execute any line of a file, the quickest first."""
-        tests = set().union(*self.tests.get(path, {}).values()) & self.seconds.keys()
-        return sorted({t.partition("::")[0] for t in tests}, key=self._file)
+    @cached_property
+    def files(self) -> dict[str, Counter[str]]:
+        """Count, for every file of the packages and every test file, the lines of the one that the other executes."""
+        return {
+            path: Counter(file for tests in at.values() for file in {t.partition("::")[0] for t in tests})
+            for path, at in self.tests.items()
+        }
 
-    def _file(self, test: str) -> tuple[float, str]:
-        file = test.partition("::")[0]
-        return sum(s for t, s in self.seconds.items() if t.startswith(file + "::")), file
+    @cached_property
+    def totals(self) -> Counter[str]:
+        """Count all lines that a test file executes."""
+        return sum(self.files.values(), Counter())
+
+    def rounds(self, path: str, line: int, most: float) -> list[list[str]]:
+        """Choose what a mutant is tried on: the tests of its line, in two helpings, and then whole files that execute its file.
+
+        A line that is executed at import belongs to no test. What is most about the mutant's file for its seconds comes first: by
+        the share that it has of a test file's lines. The last two helpings take at most ``most`` seconds of tests, as measured.
+        """
+        near: dict[str, list[str]] = {}
+        if self.knows(path) and in_function(path, line):
+            tests = self.tests.get(path, {}).get(line, set()) & self.seconds.keys()
+            for test in sorted(tests, key=lambda t: self.seconds[t]):
+                near.setdefault(test.partition("::")[0], []).append(test)
+        about = self.files.get(path, Counter())
+        cost = {file: sum(self._took(t) for t in near.get(file, [file])) for file in about}
+        files = sorted(cost, key=lambda file: -about[file] / self.totals[file] / (5 + cost[file]))
+        there = [file for file in files if file in near] or files
+        first = [t for file in there[:2] for t in near.get(file, [file])]
+        rest = [t for file in there[2:] for t in near.get(file, [])]
+        return [first, self._within(rest, most), self._within(files if near else files[2:], most)]
+
+    def _took(self, test: str) -> float:
+        if test in self.seconds:
+            return self.seconds[test]
+        return sum(s for t, s in self.seconds.items() if t.startswith(test + "::"))
+
+    def _within(self, tests: list[str], most: float) -> list[str]:
+        taken = []
+        for test in tests:
+            most -= self._took(test)
+            if most < 0:
+                break
+            taken.append(test)
+        return taken
 
 
-def digest() -> str:
-    """Return what tells one state of the packages from another."""
-    return hashlib.sha256(b"".join((ROOT / p).read_bytes() for p in product())).hexdigest()
+def in_function(path: str, line: int) -> bool:
+    """Tell whether a line runs when something is called, not at import."""
+    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    bodies = [n.body for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef))]
+    return any(body[0].lineno <= line <= (body[-1].end_lineno or 0) for body in bodies)
+
+
+def digest(path: str) -> str:
+    """Return what tells one state of a file from another."""
+    return hashlib.sha256((ROOT / path).read_bytes()).hexdigest()
 
 
 def product() -> list[str]:
@@ -144,15 +204,30 @@ def measure(tree: Path, folder: Path, jobs: int) -> dict[str, Any]:
     sources = "".join(f"    {tree / p}\n" for p in PACKAGES)
     settings.write_text(SETTINGS + f"data_file = {folder / 'lines'}\nsource =\n{sources}", encoding="utf-8")
     extra = {"COVERAGE_PROCESS_START": str(settings), "MUTANTS_TIMES": str(times)}
-    run(tree, ["-n", str(jobs), "-p", "benchmarks.mutants", "-o", "timeout=1800"], extra)
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-n",
+        str(jobs),
+        "-o",
+        "timeout=1800",
+    ]
+    env = {**os.environ, "PYTHONPATH": str(tree), **extra}
+    subprocess.run([*command, "-p", "benchmarks.mutants"], cwd=tree, env=env, check=False)
     from coverage import CoverageData
+    from coverage.exceptions import DataError
     from coverage.numbits import numbits_to_nums
 
     lines = CoverageData(basename=str(folder / "all"))
     for part in folder.glob("lines.*"):
         other = CoverageData(basename=str(part))
-        other.read()
-        lines.update(other)
+        with suppress(DataError):  # of a process that was killed
+            other.read()
+            lines.update(other)
     lines.write()
     found: dict[str, dict[int, set[str]]] = {}
     with sqlite3.connect(folder / "all") as db:
@@ -171,23 +246,38 @@ def measure(tree: Path, folder: Path, jobs: int) -> dict[str, Any]:
             for line in numbits_to_nums(bits):
                 of_file.setdefault(line, set()).update({test} - {""})
     tests = {path: {str(n): sorted(t) for n, t in at.items()} for path, at in found.items()}
-    return {"digest": digest(), "tests": tests, **json.loads(times.read_text(encoding="utf-8"))}
+    return {
+        "digests": {p: digest(p) for p in product()},
+        "tests": tests,
+        **json.loads(times.read_text(encoding="utf-8")),
+    }
 
 
-def run(
-    tree: Path, arguments: list[str], extra: dict[str, str], limit: float | None = None
-) -> tuple[int, str]:
-    """Run pytest in a tree; returns its exit status and the first test that failed."""
-    env = {**os.environ, "PYTHONPATH": str(tree), **extra}
-    command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-p", "no:cacheprovider", *arguments]
-    try:
-        done = subprocess.run(
-            command, cwd=tree, env=env, capture_output=True, text=True, timeout=limit, check=False
-        )
-    except subprocess.TimeoutExpired:
+def run(tree: Path, arguments: list[str], limit: float) -> tuple[int, str]:
+    """Run pytest in a tree, in a fork that has the libraries in memory; returns its exit status and the first test that failed."""
+    said = tree / "said.txt"
+    child = multiprocessing.get_context("fork").Process(target=_pytest, args=(tree, arguments, said))
+    child.start()
+    child.join(limit)
+    if child.exitcode is None:
+        os.killpg(child.pid or 0, signal.SIGKILL)
+        child.join()
         return 1, f"more than {limit} s"
-    said = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return done.returncode, (said or [""])[0]
+    lines = said.read_text(encoding="utf-8", errors="replace").splitlines()
+    return child.exitcode, next((line for line in lines if line.startswith(("FAILED", "ERROR"))), "")
+
+
+def _pytest(tree: Path, arguments: list[str], said: Path) -> None:
+    os.setsid()
+    with said.open("w") as file:
+        for stream in (1, 2):
+            os.dup2(file.fileno(), stream)
+    os.chdir(tree)
+    os.environ["PYTHONPATH"] = str(tree)
+    sys.path[:] = [str(tree), *(p for p in sys.path if not Path(p).is_relative_to(ROOT / "benchmarks"))]
+    status = pytest.main(["-q", "--tb=no", "-p", "no:cacheprovider", *arguments])
+    sys.stdout.flush()
+    os._exit(int(status))
 
 
 # --- the mutants ---
@@ -309,26 +399,42 @@ def compiled(path: str, line: int) -> bool:
     )
 
 
-def trial(mutant: Mutant, tree: Path, known: Map) -> tuple[str, str]:
+def trial(mutant: Mutant, tree: Path, known: Map, most: float) -> tuple[str, str]:
     """Return ``dies``, ``lives`` or ``unseen`` (no test executes the line), and the test that noticed."""
-    if mutant.line not in known.tests.get(mutant.path, {}) and not compiled(mutant.path, mutant.line):
+    seen = mutant.line in known.tests.get(mutant.path, {}) or not known.knows(mutant.path)
+    if not seen and not compiled(mutant.path, mutant.line):
         return "unseen", ""
     file, listed = tree / mutant.path, tree / "tests-to-run.txt"
     kept, stamp = file.read_bytes(), file.stat()
     file.write_text(mutant.text, encoding="utf-8")
     try:
-        for tests in (known.near(mutant.path, mutant.line), known.far(mutant.path)):
+        for tests in known.rounds(mutant.path, mutant.line, most):
             listed.write_text("\n".join(tests), encoding="utf-8")
             skip = [f"--deselect={t}" for t in known.failed]
-            status, said = (
-                run(tree, ["-x", "-o", "timeout=300", *skip, f"@{listed}"], {}, LIMIT) if tests else (5, "")
-            )
+            if not tests:
+                continue
+            status, said = run(tree, ["-x", "-o", "timeout=300", *skip, f"@{listed}"], LIMIT)
             if status not in (0, 4, 5):  # 4: a test of the map that is gone; its file is run next
                 return "dies", said
         return "lives", ""
     finally:
         file.write_bytes(kept)
         os.utime(file, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+
+
+_MINE: list[Any] = []  # a worker's tree, the map, and the seconds
+
+
+def _take(free: Any, known: Map, most: float) -> None:
+    _MINE[:] = [free.get(), known, most]
+
+
+def _one(mutant: Mutant) -> tuple[str, str]:
+    start = time.monotonic()
+    fate, by = trial(mutant, *_MINE)
+    took = f"{time.monotonic() - start:4.0f} s"
+    print(f"{fate:6} {took}  {mutant.path}:{mutant.line} {mutant.kind}  {by}", flush=True)
+    return fate, by
 
 
 def main() -> None:
@@ -339,38 +445,46 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", default="", help="paths that begin so")
     parser.add_argument("--map", type=Path, help="file that keeps which test executes which line")
+    parser.add_argument(
+        "--most", type=float, default=90, help="seconds of further tests for one that lives on (default: 90)"
+    )
+    parser.add_argument("--again", type=Path, metavar="FILE", help="of this --out, try what lived once more")
     parser.add_argument("--out", type=Path, help="write every mutant and its fate as JSON")
     args = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="mutants-"))
     (folder / "shared").symlink_to(ROOT.parent / "shared")
-    trees: SimpleQueue[Path] = SimpleQueue()
-    for job in range(args.jobs):
-        trees.put(shutil.copytree(ROOT, folder / str(job), ignore=LEFT_OUT))
+    trees = [Path(shutil.copytree(ROOT, folder / str(job), ignore=LEFT_OUT)) for job in range(args.jobs)]
     kept = args.map or folder / "map.json"
     if not kept.exists():
-        kept.write_text(json.dumps(measure(folder / "0", folder, args.jobs)), encoding="utf-8")
+        kept.write_text(json.dumps(measure(trees[0], folder, args.jobs)), encoding="utf-8")
     read = json.loads(kept.read_text(encoding="utf-8"))
     read["tests"] = {p: {int(n): set(t) for n, t in at.items()} for p, at in read["tests"].items()}
     known = Map(**read)
-    if known.digest != digest():
-        parser.error(f"{kept} was measured on other sources: measure again (another --map)")
+    known.totals  # noqa: B018  counted once, before the workers fork
+    if changed := [p for p in product() if not known.knows(p)]:
+        print(f"Changed since {kept} was measured, every test of theirs is run: {', '.join(changed)}")
 
-    def one(mutant: Mutant) -> tuple[str, str]:
-        tree, start = trees.get(), time.monotonic()
-        try:
-            fate, said = trial(mutant, tree, known)
-        finally:
-            trees.put(tree)
-        took = f"{time.monotonic() - start:4.0f} s"
-        print(f"{fate:6} {took}  {mutant.path}:{mutant.line} {mutant.kind}  {said}", flush=True)
-        if fate != "dies":
-            print(mutant.diff(), flush=True)
-        return fate, said
-
+    for name in LIBRARIES:
+        with suppress(ImportError):
+            importlib.import_module(name)
     mutants = draw(args.count, args.seed, args.only)
-    with ThreadPoolExecutor(args.jobs) as pool:
-        fates = list(pool.map(one, mutants))
+    if args.again:
+        lived = {
+            (m["path"], m["line"]) for m in json.loads(args.again.read_text("utf-8")) if m["fate"] != "dies"
+        }
+        mutants = [m for m in mutants if (m.path, m.line) in lived]
+    fork = multiprocessing.get_context("fork")
+    free = fork.SimpleQueue()
+    for tree in trees:
+        free.put(tree)
+    with ProcessPoolExecutor(
+        args.jobs, mp_context=fork, initializer=_take, initargs=(free, known, args.most)
+    ) as pool:
+        fates = list(pool.map(_one, mutants))
     shutil.rmtree(folder)
+    for mutant, (fate, _) in zip(mutants, fates, strict=True):
+        if fate != "dies":
+            print(f"{fate}\n{mutant.diff()}")
     for package in (*PACKAGES, ""):
         of = Counter(f for m, (f, _) in zip(mutants, fates, strict=True) if m.path.startswith(package))
         print(

@@ -30,7 +30,7 @@ from calibration.evidence.page import (
     sample_recording,
     write_evidence_page,
 )
-from calibration.limits import LIMITS, judged, worst
+from calibration.limits import LENS, LIMITS, judged, worst
 from tofcapture.camera import Camera
 from tofcapture.colours import Scale
 from tofcapture.devices.sim.config import read_constants
@@ -201,6 +201,20 @@ def test_a_range_bias_is_judged_and_explained():
     assert LIMITS["bias_range"].words not in {
         c.words for c in page_content(evidence(), samples(), None, "")["problems"]
     }
+
+
+def test_limits_are_those_that_evidence_was_judged_by():
+    """Good and bearable of every number: a change turns old evidence from PASS to FAIL, or back."""
+    assert {name: (limit.good, limit.bearable) for name, limit in (LIMITS | LENS).items()} == {
+        "used": (8, 3), "rmse": (4, 5), "condition": (100, 500), "spread_rotation": (0.15, 0.5),
+        "spread_translation": (1.5, 5), "error_rotation": (0.05, 0.2), "error_translation": (0.5, 2),
+        "initial_rotation": (3, 10), "initial_translation": (30, 100), "bias_range": (1, 2.5),
+        "bias_amplitude": (1, 2.5), "bias_image": (1.5, 3), "rims": (0.6, 1.5), "wiggle": (4, 12), "image": (0.6, 0.35),
+        "sectors": (6, 4), "tilt": (15, 8), "distances": (1.4, 1.15), "uncertain_motion": (1, 3),
+        "truth_rotation": (0.1, 0.3), "truth_translation": (1, 3), "drift_rotation": (0.05, 0.2),
+        "drift_translation": (0.5, 2), "rms": (0.4, 0.8), "left_out": (0.5, 1), "pixel_sigma": (0.3, 1),
+        "coverage": (0.75, 0.5),
+    }  # fmt: skip
 
 
 def test_limits_judge_both_ways():

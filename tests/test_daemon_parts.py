@@ -40,6 +40,19 @@ def _decoded(png):
     return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
 
 
+def test_the_oldest_events_go(tmp_path, monkeypatch):
+    """A daemon that runs for years keeps its newest events only, and numbers go on."""
+    monkeypatch.setattr(store, "KEPT_EVENTS", 300)
+    store.Store(tmp_path / "q").close()
+    with sqlite3.connect(tmp_path / "q") as old:
+        old.executemany("INSERT INTO events (utc, kind, data) VALUES ('', 'log', ?)", [("{}",)] * 999)
+    old.close()
+    queue = store.Store(tmp_path / "q")
+    assert queue.remember("log", {}).id == queue.last_event() == 1000
+    assert [event.id for event in queue.events(0)] == list(range(701, 1001))
+    queue.close()
+
+
 def test_queue_outlives_its_process(tmp_path):
     """Jobs, events and numbers of events go on where they were; a request id counts once."""
     request = {"request_id": "a", "recording": "r", "scene": "s", "views": 2, "frames": 1}

@@ -11,7 +11,7 @@ from tofcapture.devices.kinematics import HOME, MODELS, forward
 from tofcapture.devices.station import read_station
 from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.poses import invert, rotation_exp, transform
-from tofcapture.record.plan import board_sampling, object_sampling, plan_views
+from tofcapture.record.plan import REMEDIES, board_sampling, object_sampling, plan_views
 from tofcapture.record.quality import board_pose, coverage
 from tofcapture.rig import Rig
 
@@ -139,6 +139,8 @@ def test_nothing_reachable_is_reported(reason, change, least):
     assert plan.refused[reason] >= least * plan.candidates
     assert "0 of 25 views" in plan.summary()
     assert reason in plan.summary()
+    words, remedy = REMEDIES[reason]
+    assert f"  {plan.refused[reason]} are {words}: {remedy}" in plan.shortfall()
 
 
 def test_obstacles_are_named():

@@ -367,8 +367,11 @@ def test_command_records_the_simulated_station(tmp_path, capsys):
     station = _small_station(tmp_path)
     words = ["record", "--calibration", "--views", "2", "--frames", "2", "--station", str(station), "--json"]
     assert main([*words, "--out", str(tmp_path / "a")]) == 0
-    first = json.loads(capsys.readouterr().out)
+    said = capsys.readouterr()
+    first = json.loads(said.out)
     assert first["recorded"] == [0, 1]
+    assert "1 board views" in said.err
+    assert "2 board views" in said.err
     assert main([*words, "--out", str(tmp_path / "a")]) == 0
     assert json.loads(capsys.readouterr().out)["kept"] == [0, 1]
     assert main([*words, "--out", str(tmp_path / "b")]) == 0

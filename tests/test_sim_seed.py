@@ -14,27 +14,27 @@ from tofcapture.devices.sim.shapes import FAMILIES
 from tofcapture.devices.sim.world import SimWorld
 from tofcapture.poses import look_at
 
-# Vertices, triangles and a checksum of the corners of every family's object of seed 3.
+# Vertices, triangles and a checksum of the corners of every family's objects of seeds 0 to 11: every letter and every variant is there.
 SHAPES = {
-    "blob": (6050, 12096, 0.0604167279),
-    "board": (390, 804, -1.0066005817),
-    "bottle": (2210, 4416, 0.1604439705),
-    "bowl": (4898, 9792, 0.1085293456),
-    "box": (8, 12, 0.3311614086),
-    "bracket": (214, 428, 1.1393562465),
-    "cone": (194, 384, 0.2854304382),
-    "cup": (4514, 9024, 0.1991031045),
-    "dumbbell": (6874, 13736, 0.0024153740),
-    "gear": (264, 528, -0.5255227886),
-    "lathe": (5762, 11520, 0.0295322288),
-    "mug": (5316, 10624, 0.1673319448),
-    "plate": (320, 664, 0.1297654493),
-    "sphere": (3386, 6768, -0.0061170405),
-    "stack": (152, 296, 0.0524849580),
-    "steps": (28, 52, 0.1302248661),
-    "text": (32, 56, -0.0353070719),
-    "tool": (214, 428, 0.0079282358),
-    "wedge": (8, 12, 0.4927550381),
+    "blob": (72600, 145152, -0.0205197171),
+    "board": (4680, 9648, -0.7852325094),
+    "bottle": (26520, 52992, 0.1084483053),
+    "bowl": (59352, 118656, 1.1036674377),
+    "box": (96, 144, 1.0777927370),
+    "bracket": (2568, 5136, -4.3039507259),
+    "cone": (2328, 4608, 2.5589224484),
+    "cup": (54552, 109056, -0.6049453125),
+    "dumbbell": (82488, 164832, 0.0011219204),
+    "gear": (5312, 10756, 1.4080087865),
+    "lathe": (69144, 138240, 0.3388618658),
+    "mug": (64176, 128256, 0.1966404924),
+    "plate": (3936, 8176, -5.1268993339),
+    "sphere": (40632, 81216, 0.0002240336),
+    "stack": (2056, 3968, -3.0931799743),
+    "steps": (288, 528, -0.9476969695),
+    "text": (690, 1264, 0.4085445183),
+    "tool": (2952, 5904, 0.5133493258),
+    "wedge": (96, 144, 0.7188949942),
 }
 # Names of a scene's objects and a checksum of corners and albedos, seed 0.
 SCENES = {
@@ -57,9 +57,9 @@ def checksum(*arrays):
 @pytest.mark.parametrize("family", sorted(FAMILIES))
 def test_shapes_of_a_seed(family):
     """Every vertex and every triangle is in its place."""
-    vertices, triangles = FAMILIES[family](np.random.default_rng(3))
-    assert (len(vertices), len(triangles)) == SHAPES[family][:2]
-    assert checksum(vertices[triangles]) == pytest.approx(SHAPES[family][2], abs=1e-8)
+    meshes = [FAMILIES[family](np.random.default_rng(seed)) for seed in range(12)]
+    assert tuple(sum(map(len, part)) for part in zip(*meshes, strict=True)) == SHAPES[family][:2]
+    assert checksum(*(v[t] for v, t in meshes)) == pytest.approx(SHAPES[family][2], abs=1e-8)
 
 
 @pytest.mark.parametrize("name", sorted(SCENES))

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from tests.test_sim_seed import checksum
 from tofcapture.devices.sim.scene import Caster, merge, unit_rays
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, generator
 from tofcapture.errors import ConfigError
@@ -35,6 +36,15 @@ end_header
 """
 
 
+# Objects in the first eight scenes of seed 0, and a checksum of their corners and albedos: a change makes other datasets.
+SCENES = {
+    "tof100": (78, 28.3089461),
+    "indoor": (172, -58.1913253),
+    "multipath": (27, 2.9166969),
+    "noise": (74, -29.0780345),
+}
+
+
 def scenes(suite, count, seed=0, meshes=()):
     recipe = load_recipe(suite)
     return [make_scene(recipe, i, seed, meshes) for i in range(count)]
@@ -51,6 +61,15 @@ def test_same_seed_same_scenes(suite):
         merge(a.objects).corners.tobytes() != merge(b.objects).corners.tobytes()
         for a, b in zip(first, other, strict=True)
     )
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_scenes_of_a_seed(suite):
+    """Every wall, shelf and instrument is in its place."""
+    objects = [o for scene in scenes(suite, 8) for o in scene.objects]
+    assert len(objects) == SCENES[suite][0]
+    found = checksum(*(o.corners() for o in objects), [o.albedo for o in objects])
+    assert found == pytest.approx(SCENES[suite][1], abs=1e-6)
 
 
 @pytest.mark.parametrize("suite", SUITES)
