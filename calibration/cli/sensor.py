@@ -56,12 +56,13 @@ def believed_rig(recording: Path, given: Path | None = None) -> Rig:
 
 def saved(args: argparse.Namespace, name: str, data: dict[str, Any], rig: Rig, text: str) -> Outcome:
     """Write a report and the rig it leads to into the recording, unless it is a dry run."""
+    from calibration.evidence import write_json
     from tofcapture.files.seal import write_text
     from tofcapture.rig import dumps_rig
 
     if not args.dry_run:
         path = args.recording / "rig.toml"
-        write_text(args.recording / name, json.dumps(data, indent=1, allow_nan=False) + "\n")
+        write_json(args.recording / name, data)
         write_text(path, dumps_rig(rig))
         data = {**data, "rig": str(path)}
     return Outcome(data=data, text=text)
@@ -191,13 +192,21 @@ def run_range(args: argparse.Namespace) -> Outcome:
 
 
 def _orders(text: str) -> tuple[int, ...]:
-    try:
-        orders = tuple(sorted({int(m) for m in text.split(",")}))
-    except ValueError as err:
-        raise UsageError(f"--orders: expected whole numbers such as 1,2,4, got {text!r}") from err
+    orders = sorted(set(_listed("--orders", text, int, "whole numbers such as 1,2,4")))
     if orders[0] < 1 or orders[-1] > 16:
         raise UsageError(f"--orders: expected harmonics from 1 to 16, got {text!r}")
-    return orders
+    return tuple(orders)
+
+
+def _listed(flag: str, text: str, kind: type, expected: str, count: int | None = None) -> list[Any]:
+    """Read numbers between commas, ``count`` of them where that is given."""
+    try:
+        found = [kind(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if not found or len(found) != (count or len(found)):
+        raise UsageError(f"{flag}: expected {expected}, got {text!r}")
+    return found
 
 
 def _vouched(recording: Path, rig: Rig) -> tuple[Float64, Float64 | None, str]:
@@ -371,25 +380,14 @@ def run_phase_order(args: argparse.Namespace) -> Outcome:
     from calibration.phase_order.find import find_phase_order
     from calibration.phase_order.raw_files import read_raw
 
-    try:
-        hz = [1e6 * float(f) for f in args.mhz.split(",")]
-    except ValueError as err:
-        raise UsageError(f"--mhz: expected numbers such as 20,100, got {args.mhz!r}") from err
+    hz = [1e6 * f for f in _listed("--mhz", args.mhz, float, "numbers such as 20,100")]
     reference = None if args.reference is None else _array(args.reference)
-    order = find_phase_order(read_raw(args.raw, 4 * len(hz), _size(args.shape)), hz, reference)
+    size = args.shape and _listed("--shape", args.shape, int, "H,W such as 180,240", 2)
+    shape = (size[0], size[1]) if size else None
+    order = find_phase_order(read_raw(args.raw, 4 * len(hz), shape), hz, reference)
     data = {"format": "tofcapture-phase-order", "version": 1, **asdict(order)}
     data["offset_rad"] = [None if np.isnan(x) else x for x in order.offset_rad]  # NaN is not JSON
     return kit.written(data, _order_table(order), args.out)
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    try:
-        height, width = (int(n) for n in text.split(","))
-    except ValueError as err:
-        raise UsageError(f"--shape: expected H,W such as 180,240, got {text!r}") from err
-    return height, width
 
 
 def _order_table(order: PhaseOrder) -> str:
