@@ -89,14 +89,8 @@ class _Equations:
 def fit_lens(model: Model, look: Look, camera: Camera) -> tuple[BoardLens, list[str]]:
     """Look for boards, fit a lens, and look once more with it for boards that the wrong lens hid.
 
-    Parameters
-    ----------
-    model
-        The board.
-    look
-        Finds the boards of all views with a lens, and says why it did not find others.
-    camera
-        To start from, good to some per cent.
+    ``look`` finds the boards of all views with a lens, and says why it did not find others; ``camera`` is where to start, good to some
+    per cent.
 
     Returns the lens of the second look, unless the boards found in addition do not fit it, and why views were not used.
     Raises as :func:`fit_lens_to_board`.
@@ -115,21 +109,9 @@ def fit_lens(model: Model, look: Look, camera: Camera) -> tuple[BoardLens, list[
 def fit_lens_to_board(model: Model, views: Sequence[BoardSeen], camera: Camera) -> BoardLens:
     """Fit a lens to rims, as rich as the views ask for.
 
-    Parameters
-    ----------
-    model
-        The board.
-    views
-        At least five, tilted, that together reach the corners of the image.
-    camera
-        To start from, good to some per cent.
+    At least five views, tilted, that together reach the corners of the image; ``camera`` is where to start, good to some per cent.
 
-    Raises
-    ------
-    DataError
-        Too few views.
-    LensRefused
-        No lens fits.
+    :class:`DataError` for too few views, :class:`LensRefused` where no lens fits.
     """
     if len(views) < MIN_VIEWS:
         raise DataError(

@@ -81,25 +81,11 @@ def write_evidence_page(
 ) -> Path:
     """Write ``RECORDING/evidence.html``.
 
-    Residuals are computed anew from the views, at the transform that the evidence states. Same inputs, same bytes.
+    Residuals are computed anew from the views, at the transform that the evidence states: that of ``evidence.json`` unless it is given.
+    ``old`` is an older alignment to compare with. ``progress`` is called with a stage, steps done and steps in all. Same inputs, same
+    bytes.
 
-    Parameters
-    ----------
-    recording
-        Folder with ``views/calibration`` and, unless given, ``evidence.json``.
-    old
-        An older alignment to compare with.
-    evidence
-        What ``align`` found.
-    progress
-        Called with a stage, steps done and steps in all.
-
-    Raises
-    ------
-    ConfigError
-        jinja2 or matplotlib is not installed.
-    DataError
-        No readable evidence or views.
+    :class:`ConfigError` where jinja2 or matplotlib is not installed, :class:`DataError` for no readable evidence or views.
     """
     found = read_evidence(recording) if evidence is None else evidence
     moved = None if old is None else drift(found, old)

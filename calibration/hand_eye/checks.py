@@ -66,10 +66,7 @@ class HandEyeRefused(QualityError):  # noqa: N818  a gate's answer is a refusal,
 def clean(T: ArrayLike, name: str) -> Float64:
     """Coerce to rigid transforms (N, 4, 4), rounded rotations made exact.
 
-    Raises
-    ------
-    DataError
-        Wrong shape, NaN or infinity, mirrored or scaled rotation, wrong last row; the index of the first bad pair is named.
+    :class:`DataError` for a wrong shape, NaN or infinity, a mirrored or scaled rotation, a wrong last row. It names the first bad pair.
     """
     out = np.array(T, dtype=np.float64)
     if out.ndim != 3 or out.shape[1:] != (4, 4):
@@ -116,10 +113,7 @@ def check_motion(A: Float64, B: Float64) -> tuple[float, float, float]:
 
     Returns the RMS rotation of the relative motions of the hand about their three principal axes, radians, descending.
 
-    Raises
-    ------
-    HandEyeRefused
-        Pure translation, rotations too small, a single rotation axis; mismatched pairs when only the hand turns.
+    :class:`HandEyeRefused` for pure translation, rotations too small, a single rotation axis; mismatched pairs when only the hand turns.
     """
     (largest, sigma), (largest_seen, sigma_seen) = (_spread(M) for M in _couples(A, B))
     degrees = np.degrees(sigma)

@@ -39,14 +39,7 @@ def oriented(A: Float64, *, eye_to_hand: bool) -> Float64:
 def check_agreement(A: Float64, B: Float64, found: Consensus, *, eye_to_hand: bool) -> None:
     """Refuse pairs that fit badly, or that fit much better once a mistake is undone, by the cause that explains them best.
 
-    Parameters
-    ----------
-    A, B
-        (N, 4, 4) hand and target poses as they were given.
-    found
-        Their consensus.
-    eye_to_hand
-        How they are read.
+    A and B are (N, 4, 4) hand and target poses as they were given, ``found`` is their consensus, ``eye_to_hand`` how they are read.
     """
     P = oriented(A, eye_to_hand=eye_to_hand)
     few = thinned(len(A), SHOWN)

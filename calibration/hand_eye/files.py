@@ -73,17 +73,10 @@ class Readings:
 def read_pairs(path: Path) -> tuple[Float64, Float64, dict[str, str]]:
     """Read pairs of poses of hand and target from one file.
 
-    Returns
-    -------
-    hand, target
-        (N, 4, 4) float64, metres; not yet checked to be rigid.
-    read_as
-        What had to be found out: the order of quaternions, millimetres.
+    Returns hand and target, (N, 4, 4) float64, metres, not yet checked to be rigid, and what had to be found out: the order of
+    quaternions, millimetres.
 
-    Raises
-    ------
-    DataError, FormatError
-        No such file, or another layout.
+    :class:`DataError` or :class:`FormatError` for no such file, or another layout.
     """
     return most_consistent(*_two(path, _content(path)))
 
@@ -91,10 +84,8 @@ def read_pairs(path: Path) -> tuple[Float64, Float64, dict[str, str]]:
 def read_poses(path: Path) -> Readings:
     """Read one file of poses, with times or without.
 
-    Raises
-    ------
-    DataError, FormatError
-        No such file, another number of columns, words, or quaternions that are not of length 1.
+    :class:`DataError` or :class:`FormatError` for no such file, another number of columns, words, or quaternions that are not of
+    length 1.
     """
     content = _content(path)
     if isinstance(content, str):
@@ -112,10 +103,7 @@ def read_poses(path: Path) -> Readings:
 def readings_of(values: Sequence[Any], where: str) -> Readings:
     """Read a list of poses: nested 4x4 or 3x4, flat 16, 12 or 7 numbers, or dictionaries of a translation and a rotation.
 
-    Raises
-    ------
-    DataError, FormatError
-        Naming the first pose that is none.
+    :class:`DataError` or :class:`FormatError` names the first pose that is none.
     """
     rows = [_flat(v, f"{where}: pose {i}") for i, v in enumerate(values)]
     orders, widths = {order for order, _ in rows}, {len(row) for _, row in rows}
@@ -129,12 +117,8 @@ def readings_of(values: Sequence[Any], where: str) -> Readings:
 def most_consistent(hand: Readings, target: Readings) -> tuple[Float64, Float64, dict[str, str]]:
     """Choose the readings of quaternions under which hand and target move rigidly together.
 
-    Returns
-    -------
-    hand, target
-        (N, 4, 4), metres.
-    read_as
-        What was decided or converted, in words; empty where files were in metres and the usual order.
+    Returns hand and target, (N, 4, 4), metres, and in words what was decided or converted; empty where files were in metres and the
+    usual order.
     """
     both = list(product(hand.poses, target.poses))
     names = both[0]

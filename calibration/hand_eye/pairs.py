@@ -67,25 +67,12 @@ def stream_pairs(
 ) -> tuple[Float64, Float64, dict[str, Any]]:
     """Pair two streams, and find the offset of their clocks where it is not given.
 
-    Parameters
-    ----------
-    hand, target
-        The streams.
-    offset
-        Seconds; the hand pose at ``t + offset`` belongs to the target pose at ``t``.
+    The hand pose at ``t + offset``, seconds, belongs to the target pose at ``t``.
 
-    Returns
-    -------
-    hand, target
-        (M, 4, 4) pairs: target poses evenly chosen, hand poses interpolated.
-    found
-        As JSON types: ``time_offset_s``; where it was found also ``time_offset_sigma_s`` (None where the likelihood has no
-        curvature) and ``correlation``.
+    Returns target poses evenly chosen and hand poses interpolated, (M, 4, 4) each, hand first. Then, as JSON types, ``time_offset_s``;
+    where it was found also ``time_offset_sigma_s`` (None where the likelihood has no curvature) and ``correlation``.
 
-    Raises
-    ------
-    HandEyeRefused
-        No correlation, two offsets that fit alike (periodic motion), or streams that do not overlap.
+    :class:`HandEyeRefused` for no correlation, two offsets that fit alike (periodic motion), or streams that do not overlap.
     """
     if offset is not None:
         return *_pairs_at(hand, target, offset), {"time_offset_s": offset}
@@ -218,19 +205,8 @@ def recording_pairs(
 ) -> tuple[Float64, Float64]:
     """Take T_base_flange and T_stereo_target (N, 4, 4) from the views that register; the target is the first view's stereo frame.
 
-    Parameters
-    ----------
-    recording
-        Folder with ``views/calibration/view-*.h5``.
-    progress
-        Called with a stage, steps done and steps in all.
-
-    Raises
-    ------
-    DataError
-        No or unreadable views.
-    QualityError
-        Fewer than three views register.
+    ``progress`` is called with a stage, steps done and steps in all. :class:`DataError` for no or unreadable views,
+    :class:`QualityError` where fewer than three register.
     """
     paths = calibration_views(recording)
     fixed, hand, target, refused = _seen(paths[0]), [], [], []

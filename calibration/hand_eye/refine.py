@@ -64,16 +64,9 @@ def refine(
 ) -> Refined:
     """Refine X and Z from a start by Gauss-Newton inside expectation-maximisation.
 
-    Parameters
-    ----------
-    P, B
-        (N, 4, 4) pairs, N >= 3; P is T_flange_base, not T_base_flange, where ``eye_to_hand``.
-    X, Z
-        Start, (4, 4).
-    noise
-        First guess of the noise per axis: metres, radians.
-    blocks
-        Stretches of consecutive pairs that share their errors (streams); each pair is its own when None.
+    P and B are (N, 4, 4) pairs, N >= 3; P is T_flange_base, not T_base_flange, where ``eye_to_hand``. X and Z are the start,
+    (4, 4), ``noise`` is a first guess of the noise per axis, metres and radians. ``blocks`` are stretches of consecutive pairs that
+    share their errors (streams); each pair is its own when None.
     """
     whole = np.repeat(np.square(np.maximum(noise, FLOOR)), 3)
     camera, arm = np.diag(whole / 2), whole / 2

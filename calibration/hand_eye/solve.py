@@ -65,23 +65,12 @@ def solve_hand_eye(
 ) -> HandEye:
     """Calibrate hand and eye from pairs of poses, or refuse by name.
 
-    Parameters
-    ----------
-    hand
-        (N, 4, 4) T_base_flange, metres.
-    target
-        (N, 4, 4) T_camera_target of the same moments, metres.
-    eye_to_hand
-        The camera stands beside the arm and sees a target on the flange.
-    blocks
-        Stretches of consecutive pairs that share their errors, for the covariance of streams; None for single shots.
+    ``hand`` is (N, 4, 4) T_base_flange, ``target`` (N, 4, 4) T_camera_target of the same moments, metres. With ``eye_to_hand`` the
+    camera stands beside the arm and sees a target on the flange. ``blocks`` are stretches of consecutive pairs that share their errors,
+    for the covariance of streams; None for single shots.
 
-    Raises
-    ------
-    DataError
-        NaN, mirrored or otherwise impossible poses, lists of different length.
-    HandEyeRefused
-        Motion or pairs that give no calibration; ``cause`` names why.
+    :class:`DataError` for NaN, mirrored or otherwise impossible poses and lists of different length, :class:`HandEyeRefused` for motion
+    or pairs that give no calibration; its ``cause`` names why.
     """
     A, B = clean(hand, "hand poses"), clean(target, "target poses")
     check_numbers(A, B)

@@ -75,25 +75,11 @@ def fit_ranges(
 ) -> RangeFit:
     """Fit the range errors of all frequencies.
 
-    Parameters
-    ----------
-    seen
-        At least six views, from the nearest to the farthest range that matters.
-    T_tof_stereo
-        (4, 4).
-    transform_sigma
-        (6,) what it is known to: metres and radians about ``centre``, ToF axes.
-    orders
-        Of the harmonics.
-    centre
-        (3,) ToF frame, metres; the middle of the surfaces by default.
+    At least six views, from the nearest to the farthest range that matters. ``T_tof_stereo`` (4, 4) is known to ``transform_sigma``
+    (6,), metres and radians about ``centre`` (3,), ToF frame, metres: the middle of the surfaces by default. ``orders`` are those of the
+    harmonics.
 
-    Raises
-    ------
-    DataError
-        Too few views, or views of different cameras.
-    QualityError
-        Ranges that are no ranges of these surfaces.
+    :class:`DataError` for too few views, or views of different cameras; :class:`QualityError` for ranges that are none of these surfaces.
     """
     if len(seen) < MIN_VIEWS:
         raise DataError(
