@@ -60,21 +60,12 @@ def find_phase_order(
 ) -> PhaseOrder:
     """Find what each raw channel is.
 
-    Parameters
-    ----------
-    raw
-        (frames, K, H, W), or (K, H, W), any real dtype; K is 4 per frequency; unipolar or bipolar taps.
-    modulation_hz
-        The one or two modulation frequencies, in any order, Hz.
-    radial
-        (H, W) known distance along the ray, metres, NaN where unknown; None when there is none.
+    ``raw`` is (frames, K, H, W), or (K, H, W), any real dtype; K is 4 per frequency; unipolar or bipolar taps. ``modulation_hz`` are
+    the one or two modulation frequencies, in any order, Hz. ``radial`` (H, W) is the known distance along the ray, metres, NaN where
+    unknown.
 
-    Raises
-    ------
-    DataError
-        Wrong shapes, other than one or two frequencies, NaN only.
-    PhaseOrderRefused
-        No four-phase structure, or more than one reading fits.
+    :class:`DataError` for wrong shapes, other than one or two frequencies, NaN only. :class:`PhaseOrderRefused` for no four-phase
+    structure, or more than one reading that fits.
     """
     hz = frequencies(modulation_hz)
     taps, pixels, shape = _usable_pixels(np.asarray(raw), len(hz))

@@ -20,23 +20,12 @@ HEADER_ROWS = 4  # at most so many rows of an image are metadata
 def read_raw(path: Path, channels: int, shape: tuple[int, int] | None = None) -> NDArray[Any]:
     """Read raw frames.
 
-    Parameters
-    ----------
-    path
-        ``.npy``, ``.npz`` or ``.h5`` (the one array of 3 or more axes in it), a folder of images or of binary files, or one binary file.
-    channels
-        Phase images of one frame: 4 per frequency.
-    shape
-        (H, W) of binary files, which do not say.
+    ``path`` is ``.npy``, ``.npz`` or ``.h5`` (the one array of 3 or more axes in it), a folder of images or of binary files, or one
+    binary file. ``channels`` are the phase images of one frame, 4 per frequency. ``shape`` (H, W) is that of binary files, which do not say.
 
-    Returns
-    -------
-    (frames, K, H, W), native byte order, rows of metadata taken off.
+    Returns (frames, K, H, W), native byte order, rows of metadata taken off.
 
-    Raises
-    ------
-    DataError, FormatError
-        No such file, nothing in it, sizes that do not fit.
+    :class:`DataError` or :class:`FormatError` for no such file, nothing in it, sizes that do not fit.
     """
     suffix = path.suffix.lower()
     if not path.exists():

@@ -45,22 +45,9 @@ class Terms:
     ) -> Float64:
         """Say what each coefficient multiplies.
 
-        Parameters
-        ----------
-        range_
-            (N,) true ranges, metres: half the path of the light.
-        radius_px
-            (N,) distances to the principal point, pixels.
-        place
-            (N, 2) of :func:`tofcapture.rig.image_places`; for terms over the image.
-        celsius
-            Temperature of the sensor; for its term.
-        amplitude
-            (N,) raw units; for the term of dark surfaces.
-
-        Returns
-        -------
-        (N, T) float64.
+        The true ranges (N,), half the path of the light, are in metres, ``radius_px`` (N,) is the distance to the principal point, pixels.
+        ``place`` (N, 2) of :func:`tofcapture.rig.image_places` serves terms over the image, ``celsius`` that of the sensor's temperature,
+        ``amplitude`` (N,), raw units, that of dark surfaces. The answer is (N, T) float64.
         """
         phase = 4 * np.pi * self.modulation_hz / SPEED_OF_LIGHT * range_
         out = []
@@ -105,17 +92,10 @@ class Terms:
 def jackknife(left_out: Float64) -> tuple[Float64, Float64]:
     """Say what leaving views out says of a result.
 
-    Parameters
-    ----------
-    left_out
-        (N, K) results without each of the views in turn; transforms as twists from any fixed one near them.
+    ``left_out`` (N, K) are results without each of the views in turn; transforms as twists from any fixed one near them.
 
-    Returns
-    -------
-    influence
-        (N, K) how far each view alone departs from all: Tukey's pseudo-values about their mean.
-    covariance
-        (K, K), widened by Student's t so that one sigma holds 68 % of the time however few the views are.
+    Returns the influence (N, K), how far each view alone departs from all: Tukey's pseudo-values about their mean. Then the covariance
+    (K, K), widened by Student's t so that one sigma holds 68 % of the time however few the views are.
     """
     from scipy.stats import norm, t
 
