@@ -3,13 +3,19 @@
     python benchmarks/mutants.py [--count 130] [--seed 0] [--jobs 2] [--only calibration/] [--map FILE] [--out FILE]
 
 A mutant is one change to one expression or statement of the three packages: a comparison, an operator, a number, an and/or, a
-condition, a dropped call. Lines are drawn evenly over the packages, and one place on each. First the default tests run once, in a copy of the tree, and it is noted which test
-executes which line, in its own process or in one that it starts. A mutant is tried on the tests that execute its line, then on the
-whole test files that hold them. Where none is known (constants, what numba compiles), these are the files that execute any line of its file. A line that
-no test executes lives without a trial. The survivors are printed as diffs: whoever reads them judges which change no behaviour (a bound that is never met,
-a log line, a cache size), and says so beside the figure.
+condition, a dropped call. Lines are drawn evenly over the packages, and one place on each.
 
-Needs ``coverage``. ``--map`` keeps what the first run measured; of files that changed since, no line is known.
+First the default tests run once, in a copy of the tree, and it is noted which test executes which line, in its own process or in
+one that it starts. A mutant is tried on the tests that execute its line, then on whole test files that execute its file, those that
+are most about it first. Both end after ``--most`` seconds of tests, so a mutant that is said to live may die in the full run. A line
+that no test executes lives without a trial.
+
+The survivors are printed as diffs. Whoever reads them judges which change no behaviour (a bound that is never met, a log line, a
+cache size), and says so beside the figure. ``--again FILE`` tries the survivors of an earlier ``--out`` once more, for instance with
+more seconds or after tests were added.
+
+Needs ``coverage`` installed in the interpreter's own site-packages: its start-up hook measures the processes of tests. ``--map``
+keeps what the first run measured. Of a file that changed since, no line is known, and every test of the file is tried.
 """
 
 from __future__ import annotations
@@ -23,6 +29,7 @@ import json
 import multiprocessing
 import os
 import random
+import re
 import shutil
 import signal
 import sqlite3
@@ -30,7 +37,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -43,17 +50,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("tofcapture", "calibration", "tofcapture_model")
 LEFT_OUT = shutil.ignore_patterns(".*", "build", "__pycache__")
-LIBRARIES = (
-    "torch",
-    "numba",
-    "cv2",
-    "h5py",
-    "scipy.optimize",
-    "scipy.ndimage",
-    "scipy.spatial",
-    "scipy.stats",
-    "matplotlib.figure",
-)
+# Loaded once, before tests run in forks; nothing of the product may be among them.
+LIBRARIES = ("torch", "numba", "cv2", "h5py", "scipy.optimize", "scipy.ndimage", "scipy.spatial", "scipy.stats",
+             "matplotlib.figure")  # fmt: skip
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # as the tests' conftest does; a fork may not inherit threads
 LIMIT = 900  # s of the clock for one helping of tests
@@ -100,7 +99,7 @@ def pytest_sessionfinish() -> None:
         now.save()
 
 
-_SECONDS: Counter[str] = Counter()
+_SECONDS: defaultdict[str, float] = defaultdict(float)
 _FAILED: set[str] = set()
 
 
@@ -126,7 +125,7 @@ class Map:
     """Which tests execute a line, how long each test takes, which ones fail without any mutant."""
 
     digests: dict[str, str]  # of the files as they were measured
-    tests: dict[str, dict[int, set[str]]]  # path -> line -> tests; an import belongs to no test
+    tests: dict[str, dict[int, set[str]]]  # path -> line -> tests; "" where an import executes it
     seconds: dict[str, float]
     failed: list[str]
 
@@ -138,7 +137,9 @@ class Map:
     def files(self) -> dict[str, Counter[str]]:
         """Count, for every file of the packages and every test file, the lines of the one that the other executes."""
         return {
-            path: Counter(file for tests in at.values() for file in {t.partition("::")[0] for t in tests})
+            path: Counter(
+                file for tests in at.values() for file in {t.partition("::")[0] for t in tests - {""}}
+            )
             for path, at in self.tests.items()
         }
 
@@ -150,12 +151,13 @@ class Map:
     def rounds(self, path: str, line: int, most: float) -> list[list[str]]:
         """Choose what a mutant is tried on: the tests of its line, in two helpings, and then whole files that execute its file.
 
-        A line that is executed at import belongs to no test. What is most about the mutant's file for its seconds comes first: by
+        Of a line that runs at import only the files are known. What is most about the mutant's file for its seconds comes first: by
         the share that it has of a test file's lines. The last two helpings take at most ``most`` seconds of tests, as measured.
         """
         near: dict[str, list[str]] = {}
-        if self.knows(path) and in_function(path, line):
-            tests = self.tests.get(path, {}).get(line, set()) & self.seconds.keys()
+        tests = self.tests.get(path, {}).get(line, {""}) if self.knows(path) else {""}
+        if "" not in tests:
+            tests = tests & self.seconds.keys()
             for test in sorted(tests, key=lambda t: self.seconds[t]):
                 near.setdefault(test.partition("::")[0], []).append(test)
         about = self.files.get(path, Counter())
@@ -181,13 +183,6 @@ class Map:
         return taken
 
 
-def in_function(path: str, line: int) -> bool:
-    """Tell whether a line runs when something is called, not at import."""
-    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
-    bodies = [n.body for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef))]
-    return any(body[0].lineno <= line <= (body[-1].end_lineno or 0) for body in bodies)
-
-
 def digest(path: str) -> str:
     """Return what tells one state of a file from another."""
     return hashlib.sha256((ROOT / path).read_bytes()).hexdigest()
@@ -204,20 +199,9 @@ def measure(tree: Path, folder: Path, jobs: int) -> dict[str, Any]:
     sources = "".join(f"    {tree / p}\n" for p in PACKAGES)
     settings.write_text(SETTINGS + f"data_file = {folder / 'lines'}\nsource =\n{sources}", encoding="utf-8")
     extra = {"COVERAGE_PROCESS_START": str(settings), "MUTANTS_TIMES": str(times)}
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-n",
-        str(jobs),
-        "-o",
-        "timeout=1800",
-    ]
+    words = f"-m pytest -q -p no:cacheprovider -p benchmarks.mutants -o timeout=1800 -n {jobs}"
     env = {**os.environ, "PYTHONPATH": str(tree), **extra}
-    subprocess.run([*command, "-p", "benchmarks.mutants"], cwd=tree, env=env, check=False)
+    subprocess.run([sys.executable, *words.split()], cwd=tree, env=env, check=False)
     from coverage import CoverageData
     from coverage.exceptions import DataError
     from coverage.numbits import numbits_to_nums
@@ -231,20 +215,14 @@ def measure(tree: Path, folder: Path, jobs: int) -> dict[str, Any]:
     lines.write()
     found: dict[str, dict[int, set[str]]] = {}
     with sqlite3.connect(folder / "all") as db:
-        rows = db.execute(
-            "select path, context, numbits from line_bits join file on file.id = file_id join context on context.id = context_id"
-        )
+        words = "select path, context, numbits from line_bits join file on file.id = file_id "
+        rows = db.execute(words + "join context on context.id = context_id")
         for path, context, bits in rows:
             # "static|dynamic"; a process that a test started has the test and its phase in the static half.
-            test = (
-                context.strip("|")
-                .removesuffix(" (call)")
-                .removesuffix(" (setup)")
-                .removesuffix(" (teardown)")
-            )
+            test = re.sub(r" \((call|setup|teardown)\)$", "", context.strip("|"))
             of_file = found.setdefault(Path(path).relative_to(tree).as_posix(), {})
             for line in numbits_to_nums(bits):
-                of_file.setdefault(line, set()).update({test} - {""})
+                of_file.setdefault(line, set()).add(test)
     tests = {path: {str(n): sorted(t) for n, t in at.items()} for path, at in found.items()}
     return {
         "digests": {p: digest(p) for p in product()},

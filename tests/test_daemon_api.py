@@ -114,6 +114,8 @@ def test_records_a_scene_with_pause_and_previews(tmp_path):
         assert resting["progress"]["sealed"] == 2
         time.sleep(0.4)
         assert daemon.ask("GET", "/v1/state")["progress"] == resting["progress"]
+        metrics = set(daemon.tcp("GET", "/metrics", {})[1].splitlines())
+        assert {b"tofcapture_recorder_up 1", b"tofcapture_paused 1"} <= metrics
         daemon.ask("POST", "/v1/resume")
         assert daemon.wait(_over)["job"]["state"] == "done"
         views = daemon.ask("GET", "/v1/views")["views"]
@@ -126,7 +128,8 @@ def test_records_a_scene_with_pause_and_previews(tmp_path):
         with _stream(daemon, "?after=0") as link:
             told = _events(link, lambda kind, data: kind == "sealed" and data["progress"]["sealed"] == 6)
         assert {"paused", "resumed"} <= {kind for _, kind, _ in told}
-        assert b"tofcapture_views_sealed_total 6" in daemon.tcp("GET", "/metrics", {})[1]
+        metrics = set(daemon.tcp("GET", "/metrics", {})[1].splitlines())
+        assert {b"tofcapture_views_sealed_total 6", b"tofcapture_paused 0"} <= metrics
     for view in views:
         assert (
             read_view(tmp_path / "root" / "r" / "views" / "mug" / f"view-{view['index']:03d}.h5").scene

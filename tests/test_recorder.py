@@ -297,6 +297,9 @@ def test_a_view_that_never_works_is_given_up(tmp_path):
     assert len(result.failed) == 1
     assert "the sensor is silent" in result.reasons[0]
     assert len(result.recorded) == VIEWS - 1
+    with closing(Journal(tmp_path)) as journal:
+        noted = {row.index: row.reason for row in journal.rows() if row.state == "failed"}
+    assert noted == {result.failed[0]: "the sensor is silent"}
     assert _record(tmp_path).recorded == result.failed
 
 
