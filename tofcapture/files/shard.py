@@ -160,8 +160,10 @@ class ShardReader:
         Its digest in the manifest; ``None``: the one beside it counts, if there is one. On first use the whole file is hashed,
         once per process and for the processes that it hands readers to (docs/decisions/0016).
 
-    On first use it raises :class:`DataError` or :class:`FormatError` for a file that is missing, damaged, foreign or of another
-    version.
+    Raises
+    ------
+    DataError, FormatError
+        On first use: a file that is missing, damaged, foreign or of another version.
     """
 
     def __init__(self, path: Path | str, sha256: str | None = None) -> None:
