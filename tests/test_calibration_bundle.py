@@ -98,7 +98,10 @@ def test_a_loose_camera_is_noticed():
     arm = arms(rng)
     bundle = solve_bundle(arm, fits_of(arm, rng))
     true = poses.invert(X_TOF) @ X_STEREO
-    assert consistency(bundle, true)["agrees"]
+    said, sigma = consistency(bundle, true), np.sqrt(np.diag(bundle.rig_covariance()))
+    assert said["agrees"]
+    assert said["standard_error"]["translation_mm"] == pytest.approx(1e3 * sigma[:3])
+    assert said["standard_error"]["rotation_deg"] == pytest.approx(np.degrees(sigma[3:]))
     assert not consistency(bundle, poses.exp([0.003, 0, 0, 0, 0.009, 0]) @ true)["agrees"]
 
 

@@ -97,7 +97,9 @@ def test_folder_is_refused_or_made_private(tmp_path):
     folder = settings.open_folder(loose)
     assert loose.stat().st_mode & 0o777 == 0o700
     assert settings.token_of(folder) == settings.token_of(folder)
-    folder.token.write_text("short")
+    folder.token.write_text("x" * 32)
+    assert settings.token_of(folder) == "x" * 32
+    folder.token.write_text("x" * 31)
     with pytest.raises(ConfigError, match="token"):
         settings.token_of(folder)
     with pytest.raises(ConfigError, match="socket"):

@@ -257,6 +257,7 @@ def test_build_check_and_read(recording, tmp_path):
     result = build_dataset([recording], out, jobs=1, progress=lambda *a: seen.append(a))
     assert set(result.scenes) == {"box", "mug", "gear"}
     assert not result.failures
+    assert not result.bare
     assert len(seen) == 4
     assert check(out) == []
     assert load_manifest(out).scenes == result.scenes
