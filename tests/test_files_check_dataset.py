@@ -130,3 +130,13 @@ def test_strays_and_stale_caches_are_found(here):
     box = replace(manifest.scenes["box"], sha256=sha256_of(dataset / "shards/box.h5"))
     write_manifest(dataset, replace(manifest, scenes={**manifest.scenes, "box": box}))
     assert any("stale: box" in p.message for p in check(dataset))
+
+
+def test_half_a_dataset_is_still_checked(here):
+    """A manifest whose shards are gone, and shards without their manifest, are both found."""
+    dataset = here / "dataset"
+    shutil.move(dataset / "shards", here / "aside")
+    assert {p.path.name for p in check(dataset)} == {"box.h5", "gear.h5"}
+    shutil.move(here / "aside", dataset / "shards")
+    (dataset / "manifest.json").unlink()
+    assert [p.path for p in check(dataset)] == [dataset]

@@ -177,6 +177,7 @@ def test_channels_in_another_order_are_refused(order, tmp_path):
     with pytest.raises(DataError, match="expected channels: 20 MHz at 0, 90, 180, 270 deg") as error:
         read_input(path)
     assert "calibrate phase-order" in error.value.hint
+    assert "--frame" not in error.value.hint  # there is but one
 
 
 NOT_COUNTS = {
