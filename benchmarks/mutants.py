@@ -464,7 +464,11 @@ def main() -> None:
         if fate != "dies":
             print(f"{fate}\n{mutant.diff()}")
     for package in (*PACKAGES, ""):
-        of = Counter(f for m, (f, _) in zip(mutants, fates, strict=True) if m.path.startswith(package))
+        of = Counter(
+            f
+            for m, (f, _) in zip(mutants, fates, strict=True)
+            if m.path.startswith(f"{package}/" if package else "")
+        )
         print(
             f"{package or 'all'}: {of['dies']} of {of.total()} die, {of['lives']} live, no test executes {of['unseen']}"
         )
