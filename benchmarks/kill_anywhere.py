@@ -195,7 +195,7 @@ def finish(rig: Rig, recording: str, seconds: float = 180.0) -> None:
     """Let a recording be finished in peace."""
     end = time.monotonic() + seconds
     while rig.drive(recording) != "done":
-        assert time.monotonic() < end, f"{recording} is not finished: {rig.ask('GET', '/v1/state')}"
+        assert time.monotonic() < end, f"{recording} is not finished: {rig.ask('GET', '/v1/jobs')}"
         time.sleep(0.1)
     rig.look()
 
