@@ -37,7 +37,7 @@ OUTLIER = 0.3  # weight below which a fit has lost its vote
 
 @dataclass(frozen=True)
 class BoardFit:
-    """What one camera says of the board in one view."""
+    """Hold what one camera says of the board in one view."""
 
     view: int  #: Index into the arm's poses
     camera: str  #: ``tof`` or ``stereo``

@@ -69,7 +69,7 @@ class BoardLens:
 
 @dataclass(frozen=True)
 class _Guess:
-    """Where the fit stands."""
+    """Tell where the fit stands."""
 
     camera: Camera
     growth: float
@@ -264,7 +264,7 @@ def _rms(values: Float64) -> float:
 
 
 def _pixel_sigma(camera: Camera, covariance: Float64) -> float:
-    """What the covariance means at the image's edge, once a turn of the camera, which no user sees, is taken off."""
+    """Tell what the covariance means at the image's edge, once a turn of the camera, which no user sees, is taken off."""
     u, v = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 7))
     pixels, focal = np.stack([u.ravel(), v.ravel()], axis=1), [camera.fx, camera.fy]
     rays = camera.rays_at(pixels)

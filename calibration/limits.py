@@ -24,7 +24,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class Limit:
-    """What one number may be."""
+    """Hold what one number may be."""
 
     words: str  #: What it is
     #: PASS up to good, WARN up to bearable, FAIL beyond; downwards where ``good`` is the larger

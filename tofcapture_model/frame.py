@@ -24,7 +24,7 @@ class Frame(NamedTuple):
     gap: Tensor  #: (B, 1, H, W) range of the low minus range of the high frequency, m: the multipath cue
     cues: Tensor  #: (B, 4, H, W) depth errors that physics expects, m: geometry.multipath
     modulation: Tensor  #: (B, 2) low and high modulation frequency, Hz
-    intrinsics: Tensor  #: (B, 4 or 9) of the (H, W) grid, px: geometry.intrinsics
+    intrinsics: Tensor  #: (B, 4 or 9) of the (H, W) grid, px; see geometry.maps
     demodulation: Tensor  #: (B, 4, K) weights that turn taps into phasor
 
 

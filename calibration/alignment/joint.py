@@ -47,7 +47,7 @@ Trees = tuple[Any, Any]  # of a view's stereo surface and stereo rims
 
 @dataclass(frozen=True)
 class JointSolution:
-    """What V views say together."""
+    """Hold what V views say together."""
 
     T_tof_stereo: Float64  #: (4, 4)
     #: Range errors of :meth:`JointView.terms` at the solved transform, without scattered light: what
@@ -63,7 +63,7 @@ class JointSolution:
 
 @dataclass(frozen=True)
 class _Estimate:
-    """Where the solution stands."""
+    """Tell where the solution stands."""
 
     T: Float64  # T_stereo_tof
     coefficients: Float64  # (U + SIDES,) range errors, then the rims' insets in radians, which stay at zero

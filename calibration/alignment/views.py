@@ -1,4 +1,4 @@
-"""What a board view contributes to the joint alignment: ranges per frequency, rims, and the stereo camera's dense answer."""
+"""Define what a board view contributes to the joint alignment: ranges per frequency, rims, and the stereo camera's dense answer."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ class Detection:
 
     @property
     def score(self) -> float:
-        """What candidates are compared by: how much of the sight the model explains, and of the model is seen."""
+        """Tell what candidates are compared by: how much of the sight the model explains, and of the model is seen."""
         seen = float(np.mean(list(self.holes.values()))) if self.holes else 0.0
         return self.explained * (0.2 + seen) * (1 - min(1.0, 4 * self.contradicted))
 
@@ -247,7 +247,7 @@ def _fields(model: Model, local: Float64) -> tuple[Float64, Float64]:
 
 
 def _distance(a: Float64, b: Float64, point: Float64) -> tuple[float, float]:
-    """How far two poses differ: metres at a point (3,) of the board, and radians."""
+    """Tell how far two poses differ: metres at a point (3,) of the board, and radians."""
     moved = transform_points(a, point) - transform_points(b, point)
     return float(np.linalg.norm(moved)), rotation_angle(invert(a) @ b)
 

@@ -145,7 +145,7 @@ def clear_of_walls(T: Float64, board: Board, xy: Float64, outward: Float64) -> N
 
 @dataclass(frozen=True)
 class Sight:
-    """What a camera sees of a board."""
+    """Hold what a camera sees of a board."""
 
     rims: Float64  #: (N, 3) points on rims, camera frame, metres; only their rays count
     surface: Float64  #: (M, 3) surface points, camera frame, metres

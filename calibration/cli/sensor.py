@@ -210,7 +210,7 @@ def _listed(flag: str, text: str, kind: type, expected: str, count: int | None =
 
 
 def _vouched(recording: Path, rig: Rig) -> tuple[Float64, Float64 | None, str]:
-    """What the rig's transform is known to, about which point, and what vouches for it.
+    """Tell what the rig's transform is known to, about which point, and what vouches for it.
 
     ``evidence.json`` vouches for the ``rig.toml`` it was written with; any other rig is known to millimetres only.
     """
@@ -301,7 +301,7 @@ def _by_range(fit: RangeFit, i: int) -> list[dict[str, float]]:
 
 
 def _range_words(fit: RangeFit, far: Float64, transform_known: str) -> list[str]:
-    """What the views could not tell."""
+    """Tell what the views could not tell."""
     from calibration.range_error.fit import MIN_GREY, MIN_KELVIN, greys, warmed
 
     out = [

@@ -1,4 +1,4 @@
-"""What an alignment rests on, as JSON: residuals of every pair, the spread, every number judged, and the error where the truth is known.
+"""Define what an alignment rests on, as JSON: residuals of every pair, the spread, every number judged, and the error where the truth is known.
 
 It also says how far an alignment has moved since an older one, and whether that is more than both could be wrong.
 """

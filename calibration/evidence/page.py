@@ -255,7 +255,7 @@ def _observability(evidence: Mapping[str, Any]) -> list[list[str]]:
 
 
 def _methods(evidence: Mapping[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    """What each method found, its matrices left out."""
+    """Tell what each method found, its matrices left out."""
     found = evidence.get("methods") or {}
     return [
         (name, _rows({k: v for k, v in values.items() if not _is_matrix(v)}))

@@ -199,7 +199,7 @@ def _screws(M: Float64) -> tuple[Float64, Float64]:
 
 
 def _angle_mismatch(A: Float64, B: Float64) -> float:
-    """How much the rotation angles of hand and target differ, as a share of what random pairing would give.
+    """Tell how much the rotation angles of hand and target differ, as a share of what random pairing would give.
 
     A rigid mount makes the screws of ``A_ij`` and ``B_ij`` congruent: same angle, same translation along the axis (Chen,
     CVPR 1991). The angle is free of units, of mirroring and of inversion, so what breaks it is the pairing.

@@ -343,7 +343,7 @@ def _by_columns(table: Float64, names: list[str], where: str) -> Readings:
 
 
 def _content(path: Path) -> Any:
-    """What a file holds: lists and dictionaries, or the text of a table."""
+    """Tell what a file holds: lists and dictionaries, or the text of a table."""
     suffix = path.suffix.lower()
     try:
         if suffix in {".npz", ".npy"}:

@@ -39,7 +39,7 @@ class PhaseOrderRefused(QualityError):  # noqa: N818  a gate's answer is a refus
 
 @dataclass(frozen=True)
 class PhaseOrder:
-    """How raw channels are to be decoded."""
+    """Tell how raw channels are to be decoded."""
 
     #: (K,) as :func:`tofcapture.ops.phase.phasors` takes them: ``C_k = B + A cos(phi + phase_rad[k])``
     modulation_hz: tuple[float, ...]

@@ -182,7 +182,7 @@ def _prior(terms: Terms, amplitude: float) -> Float64:
 
 
 def _parts(terms: Sequence[Terms]) -> list[slice]:
-    """Where each frequency's coefficients stand among the shared unknowns, behind the transform's six."""
+    """Tell where each frequency's coefficients stand among the shared unknowns, behind the transform's six."""
     ends = np.cumsum([6, *[len(t.names) for t in terms]]).tolist()
     return [slice(a, b) for a, b in itertools.pairwise(ends)]
 

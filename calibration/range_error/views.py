@@ -1,4 +1,4 @@
-"""What a board view says of the ToF camera's ranges: measured against the range that the stereo surface gives every pixel."""
+"""Define what a board view says of the ToF camera's ranges: measured against the range that the stereo surface gives every pixel."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from tofcapture.rig import Rig
 
 @dataclass(frozen=True)
 class Pair:
-    """What one calibration view contributes."""
+    """Hold what one calibration view contributes."""
 
     #: Path of the view inside the recording, and digest of the file
     name: str
