@@ -1,5 +1,6 @@
 """The program itself: light, every command explained, every mistake answered in a few lines."""
 
+import argparse
 import json
 import re
 import shlex
@@ -93,3 +94,76 @@ def test_no_command_prints_help(capsys):
     """``tofcapture`` alone shows the help and succeeds."""
     assert main([]) == 0
     assert "COMMAND" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "named", "remedy"),
+    [
+        ("trian data", "'trian'", "train"),
+        ("biuld-dataset rec --out x", "'biuld-dataset'", "build-dataset"),
+        ("record --scen mug", "--scen ", "--scene"),
+        ("record --scene mug --out x --frame=3", "--frame ", "--frames"),
+        ("train data --out x --preset papr", "'papr'", "paper"),
+        ("calibrate hand-ey pairs.json", "'hand-ey'", "hand-eye"),
+        ("align rec --metod joint", "--metod ", "--method"),
+        ("predict a.h5 --averge", "--averge ", "--average"),
+    ],
+)
+def test_what_is_misspelt_is_named_and_what_was_meant_is_said(line, named, remedy, capsys):
+    """A wrong command, option or choice is named itself, before anything that is missing because of it."""
+    assert main(line.split()) == 2
+    said, hint = capsys.readouterr().err.splitlines()
+    assert named in f"{said} "
+    assert hint.startswith(f"  try: {remedy} instead")
+
+
+def _options(parsed: argparse.ArgumentParser):
+    for action in parsed._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for sub in action.choices.values():
+                yield from _options(sub)
+        elif action.nargs != 0:
+            yield parsed.prog, action
+
+
+def test_one_thing_has_one_name_in_every_help():
+    """Values have a short name in capitals, paths say what they lead to, and defaults are shown in one form."""
+    paths = {
+        "DIR",
+        "FILE",
+        "PATH",
+        "INPUT",
+        "RAW",
+        "PAIRS",
+        "HAND",
+        "TARGET",
+        "RECORDING",
+        "DATASET",
+        "WEIGHTS",
+        "BOARD",
+    }
+    for program, action in _options(parser(COMMANDS)):
+        where = f"{program} {action.dest}"
+        names = action.metavar if isinstance(action.metavar, tuple) else (action.metavar,)
+        assert all(names), where
+        if action.type is Path:
+            for name in re.split(r"[ |]+", " ".join(names)):
+                assert name in paths or re.fullmatch(
+                    r"[A-Z]+\.(toml|json|h5|npy|svg|dxf|stl|png|html|rrd)", name
+                ), where
+        assert "efault" not in action.help or re.search(r"\(default: [^()]+\)$", action.help), where
+
+
+@pytest.mark.parametrize("name", ["", *sorted(COMMANDS)])
+def test_help_fits_a_terminal_of_eighty_columns(name, monkeypatch):
+    """No line of any help is wider than 80 columns."""
+    monkeypatch.setenv("COLUMNS", "80")
+    top = parser(COMMANDS)
+    text = (
+        next(a for a in top._actions if isinstance(a, argparse._SubParsersAction)).choices[name].format_help()
+        if name
+        else top.format_help()
+    )
+    body, _, example = text.partition("example:")
+    assert max(map(len, body.splitlines())) <= 80
+    assert not name or example

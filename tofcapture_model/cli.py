@@ -40,7 +40,8 @@ def _keep_memory() -> None:
 
 
 def _device(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--device", default="cpu", help="torch device, such as cpu or cuda (default: cpu)")
+    text = "torch device, such as cpu or cuda (default: cpu)"
+    parser.add_argument("--device", default="cpu", metavar="DEVICE", help=text)
 
 
 def _checked_device(name: str) -> str:
@@ -73,17 +74,31 @@ _not_negative = _number(int, "a whole number >= 0", lambda x: x >= 0)
 
 def _configure_train(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("dataset", type=Path, nargs="+", help="folders of build-dataset; the first one's split val validates")
-    add("--out", type=Path, required=True, help="folder of the run; running again there goes on")
-    add("--preset", choices=presets(), help="where to start from (default: compact)")
-    add("--config", type=Path, help="TOML with differences from a preset")
-    add("--epochs", type=_count, help="of every stage, instead of the configuration's")
-    add("--minutes", type=_positive, help="train for so long; schedules follow the clock")
-    add("--seed", type=_not_negative, help="of weights, order and crops")
-    add("--workers", type=_not_negative, default=0, help="processes that read data (default: 0, in memory)")
-    origin = "fine-tune: start from a checkpoint, a run's folder, or 'bundled' (default preset: fine-tune)"
+    add(
+        "dataset",
+        type=Path,
+        nargs="+",
+        metavar="DATASET",
+        help="folders of build-dataset; the first one's split val validates",
+    )
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder of the run; running again there goes on",
+    )
+    known = f"{', '.join(presets())} (default: compact)"
+    add("--preset", choices=presets(), metavar="NAME", help=known)
+    add("--config", type=Path, metavar="CONFIG.toml", help="TOML with differences from a preset")
+    add("--epochs", type=_count, metavar="N", help="of every stage, instead of the configuration's")
+    add("--minutes", type=_positive, metavar="M", help="train for so long; schedules follow the clock")
+    add("--seed", type=_not_negative, metavar="N", help="of weights, order and crops")
+    workers = "processes that read data (default: 0, in memory)"
+    add("--workers", type=_not_negative, default=0, metavar="N", help=workers)
+    origin = "fine-tune: start from a checkpoint, a run's folder, or 'bundled'; --preset is fine-tune then"
     add("--from", dest="start", metavar="WEIGHTS", help=origin)
-    add("--cache", type=Path, help="read frames from what `tofcapture pack` wrote")
+    add("--cache", type=Path, metavar="DIR", help="read frames from what `tofcapture pack` wrote")
     _device(parser)
 
 
@@ -123,15 +138,32 @@ def _train(args: argparse.Namespace) -> Outcome:
 
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("dataset", type=Path, help="folder that build-dataset wrote")
+    add("dataset", type=Path, metavar="DATASET", help="folder that build-dataset filled")
     weights = "checkpoint or run's folder (default: the bundled weights); with --suite, NAME=PATH of several"
-    add("--weights", nargs="+", metavar="[NAME=]PATH", help=weights)
-    suites = "tables of several methods, written beside --out (docs/network.md); a killed one goes on"
-    add("--suite", choices=(*SUITES, "all"), help=suites)
-    add("--scenes", default="", help="only scenes whose name begins so")
-    add("--out", type=Path, default=Path("results.json"), help="default: results.json")
-    add("--split", choices=("train", "val", "test"), default="test", help="default: test")
-    add("--frames", type=_not_negative, help="of every view; 0 takes all (default: 1, with --suite all)")
+    add("--weights", nargs="+", metavar="WEIGHTS", help=weights)
+    suites = f"tables of several methods beside --out, resumable: {', '.join(SUITES)} or all"
+    add("--suite", choices=(*SUITES, "all"), metavar="NAME", help=suites)
+    add("--scenes", default="", metavar="PREFIX", help="only scenes whose name begins so")
+    add(
+        "--out",
+        type=Path,
+        default=Path("results.json"),
+        metavar="FILE.json",
+        help="table to write (default: results.json)",
+    )
+    add(
+        "--split",
+        choices=("train", "val", "test"),
+        default="test",
+        metavar="SPLIT",
+        help="train, val or test (default: test)",
+    )
+    add(
+        "--frames",
+        type=_not_negative,
+        metavar="N",
+        help="of every view; 0 takes all (default: 1, with --suite all)",
+    )
     _device(parser)
 
 
@@ -206,18 +238,23 @@ def _suite(args: argparse.Namespace) -> Outcome:
 
 def _configure_predict(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("input", type=Path, help="view file or shard (.h5), or raw (8, H, W) or (F, 8, H, W) (.npy, .npz)")
-    add("--out", type=Path, default=Path("prediction"), help="folder (default: prediction)")
-    add("--weights", type=Path, help=_WEIGHTS)
-    add("--view", type=int, default=0, help="of a shard (default: 0)")
+    add(
+        "input",
+        type=Path,
+        metavar="INPUT",
+        help="view file or shard (.h5), or raw (8, H, W) or (F, 8, H, W) (.npy, .npz)",
+    )
+    add("--out", type=Path, default=Path("prediction"), metavar="DIR", help="folder (default: prediction)")
+    add("--weights", type=Path, metavar="WEIGHTS", help=_WEIGHTS)
+    add("--view", type=int, default=0, metavar="N", help="of a shard (default: 0)")
     which = parser.add_mutually_exclusive_group()
-    which.add_argument("--frame", type=int, default=0, help="of the burst (default: 0)")
+    which.add_argument("--frame", type=int, default=0, metavar="N", help="of the burst (default: 0)")
     which.add_argument("--average", action="store_true", help="take the mean of the burst instead")
-    add("--rig", type=Path, help="rig.toml for an array (default: nominal intrinsics)")
+    add("--rig", type=Path, metavar="RIG.toml", help="rig for an array (default: nominal intrinsics)")
     saturation = "at which the sensor of an array saturates (default: 4095, 12 bits)"
     add("--saturation", type=_positive, metavar="COUNTS", help=saturation)
-    backend = "onnx: the model.onnx beside the weights (default: torch)"
-    add("--backend", choices=("torch", "onnx"), default="torch", help=backend)
+    backend = "torch, or onnx: the model.onnx beside the weights (default: torch)"
+    add("--backend", choices=("torch", "onnx"), default="torch", metavar="BACKEND", help=backend)
     _device(parser)
 
 
@@ -260,12 +297,13 @@ def _told(result: dict[str, Any], out: Path, device: str) -> str:
 
 def _configure_export(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--weights", type=Path, help=_WEIGHTS)
-    add("--out", type=Path, help="default: beside the weights, or here for the bundled ones, .onnx or .pt2")
-    kinds = "torch: torch.export (default: onnx)"
-    add("--format", choices=("onnx", "torch"), default="onnx", help=kinds)
+    add("--weights", type=Path, metavar="WEIGHTS", help=_WEIGHTS)
+    beside = "model to write (default: beside the weights, or here for the bundled ones)"
+    add("--out", type=Path, metavar="FILE", help=beside)
+    kinds = "onnx, or torch: torch.export (default: onnx)"
+    add("--format", choices=("onnx", "torch"), default="onnx", metavar="FORMAT", help=kinds)
     size = "of the sensor (default: 180 240)"
-    add("--size", type=_count, nargs=2, metavar=("HEIGHT", "WIDTH"), default=(180, 240), help=size)
+    add("--size", type=_count, nargs=2, metavar=("H", "W"), default=(180, 240), help=size)
 
 
 def _export(args: argparse.Namespace) -> Outcome:
@@ -284,11 +322,12 @@ def _export(args: argparse.Namespace) -> Outcome:
 
 def _configure_report(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--dataset", type=Path, help="folder that build-dataset wrote")
-    add("--results", type=Path, help="results.json of evaluate")
-    add("--evidence", type=Path, help="evidence.json of align")
-    add("--weights", type=Path, help=_WEIGHTS)
-    add("--out", type=Path, default=Path("report.html"), help="default: report.html")
+    add("--dataset", type=Path, metavar="DATASET", help="folder that build-dataset filled")
+    add("--results", type=Path, metavar="FILE.json", help="results.json of evaluate")
+    add("--evidence", type=Path, metavar="FILE.json", help="evidence.json of align")
+    add("--weights", type=Path, metavar="WEIGHTS", help=_WEIGHTS)
+    page = "page to write (default: report.html)"
+    add("--out", type=Path, default=Path("report.html"), metavar="FILE.html", help=page)
 
 
 def _report(args: argparse.Namespace) -> Outcome:

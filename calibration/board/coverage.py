@@ -27,7 +27,9 @@ SHADES = " .:+*#"  # of cells that no, one, two ... views have seen
 def configure_coverage(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("recording", type=Path, metavar="RECORDING", help="folder with calibration views")
-    parser.add_argument("--board", default="default", help="packaged board or a TOML file")
+    parser.add_argument(
+        "--board", default="default", metavar="BOARD", help="packaged board or a TOML file (default: default)"
+    )
 
 
 def run_coverage(args: argparse.Namespace) -> Outcome:

@@ -97,11 +97,12 @@ def configure_board(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--board",
         default="default",
-        help="packaged board (default, second) or a TOML file; see docs/board.md",
+        metavar="BOARD",
+        help="packaged board (default, second) or a TOML file, see docs/board.md (default: default)",
     )
     for kind, words in (("svg", "to print"), ("dxf", "to cut"), ("stl", "to print in 3-D")):
         parser.add_argument(
-            f"--{kind}", type=Path, metavar="OUT", help=f"write the drawing {words}, true scale"
+            f"--{kind}", type=Path, metavar=f"FILE.{kind}", help=f"write the drawing {words}, true scale"
         )
 
 

@@ -19,18 +19,24 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recording", type=Path, metavar="RECORDING", help="folder that record --calibration filled"
     )
-    parser.add_argument("--backend", default="open3d", help="open3d (default), kiss-icp or small-gicp")
+    parser.add_argument(
+        "--backend",
+        default="open3d",
+        metavar="BACKEND",
+        help="open3d, kiss-icp or small-gicp (default: open3d)",
+    )
     parser.add_argument(
         "--method",
         default="averaged",
         choices=("averaged", "weighted", "joint"),
-        help="averaged (default, the paper's), weighted by information, or joint with the range errors",
+        metavar="METHOD",
+        help="averaged as in the paper, weighted by information, or joint with range errors (default: averaged)",
     )
     parser.add_argument(
         "--initial", type=Path, metavar="RIG.toml", help="start from this rig, not from the views' own"
     )
     parser.add_argument(
-        "--compare", type=Path, metavar="OLD_RIG.toml", help="say how far the cameras moved since this rig"
+        "--compare", type=Path, metavar="RIG.toml", help="say how far the cameras moved since this rig"
     )
 
 

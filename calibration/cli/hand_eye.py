@@ -140,7 +140,7 @@ def configure_bundle(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=2,
         metavar=("M", "RAD"),
-        help="standard deviation of an arm pose per axis, metres and radians (default 0.0002 0.00017)",
+        help="standard deviation of an arm pose per axis, metres and radians (default: 0.0002 0.00017)",
     )
 
 

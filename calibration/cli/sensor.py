@@ -72,7 +72,12 @@ def add_recording(parser: argparse.ArgumentParser, *, board: bool) -> None:
     """Declare the arguments that commands on a recording share."""
     parser.add_argument("recording", type=Path, metavar="RECORDING", help="folder with calibration views")
     if board:
-        parser.add_argument("--board", default="default", help="packaged board or a TOML file")
+        parser.add_argument(
+            "--board",
+            default="default",
+            metavar="BOARD",
+            help="packaged board or a TOML file (default: default)",
+        )
     parser.add_argument("--dry-run", action="store_true", help="print the result, write nothing")
 
 
@@ -171,7 +176,7 @@ def configure_range(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rig", type=Path, metavar="RIG.toml", help="rig transform to start from (default: the recording's)"
     )
-    parser.add_argument("--orders", default="1,2,4", help="of the harmonics (default 1,2,4)")
+    parser.add_argument("--orders", default="1,2,4", metavar="K,K", help="of the harmonics (default: 1,2,4)")
 
 
 def run_range(args: argparse.Namespace) -> Outcome:
@@ -363,7 +368,7 @@ def configure_phase_order(parser: argparse.ArgumentParser) -> None:
         help="(frames, K, H, W) or (K, H, W), K = 4 per frequency: .npy, .npz, .h5, .raw, or a folder of images, one phase each",
     )
     parser.add_argument(
-        "--mhz", default="20,100", metavar="F[,F]", help="modulation frequencies in MHz (default 20,100)"
+        "--mhz", default="20,100", metavar="F[,F]", help="modulation frequencies in MHz (default: 20,100)"
     )
     parser.add_argument(
         "--reference",

@@ -7,11 +7,16 @@ asked for. Results go to stdout, progress and errors to stderr.
 from __future__ import annotations
 
 import argparse
+import difflib
+import itertools
 import json
 import os
+import re
 import sys
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Iterable, Sequence
 from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 from tofcapture import __version__
 from tofcapture.cli.kit import Command, Outcome
@@ -20,28 +25,77 @@ from tofcapture.errors import ConfigError, TofError, UsageError
 GROUP = "tofcapture.commands"
 EXIT_CODES = "exit codes: 0 ok, 1 unexpected, 2 usage, 3 config, 4 device, 5 data, 6 quality gate, 7 busy, 130 interrupted"
 DESCRIPTION = "Capture paired ToF raw data and stereo ground truth on a robot arm, build datasets, train networks on them."
-# fmt: off
-ORDER = (
-    "demo", "doctor", "record", "daemon", "status", "stop", "simulate", "simulate-dataset", "align", "calibrate",
-    "build-dataset", "check", "stats", "view", "figure", "pack", "export-dataset",
-    "train", "evaluate", "predict", "export", "report", "config", "completion",
-)
-# fmt: on
-"""Commands in the order in which they are listed; those of other packages come last."""
+GROUPS = {
+    "begin": ("demo", "doctor", "config", "completion"),
+    "record": ("record", "daemon", "status", "stop", "simulate", "simulate-dataset"),
+    "calibrate": ("align", "calibrate"),
+    "datasets": ("build-dataset", "check", "stats", "view", "figure", "pack", "export-dataset"),
+    "network": ("train", "evaluate", "predict", "export", "report"),
+}
+"""Commands under the headings of the help; those of other packages stand last, under a heading of their own."""
+WIDTH = 79
 
 
 class _Parser(argparse.ArgumentParser):
-    """An ArgumentParser that raises, so that ``--json`` covers usage errors too."""
+    """An ArgumentParser that raises, so that ``--json`` covers usage errors too, and says what was meant instead."""
+
+    def __init__(self, **more: Any) -> None:
+        super().__init__(**more, allow_abbrev=False)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse a misspelt option before argparse misses what it would have brought."""
+        known = self._option_string_actions
+        if not self._subparsers:  # else the options belong to a command
+            for word in itertools.takewhile(lambda word: word != "--", args or ()):
+                name = word.partition("=")[0]
+                if name.startswith("--") and name not in known:
+                    raise UsageError(f"no option {name} in {self.prog}", hint=_meant(name, known, self.prog))
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> None:  # type: ignore[override]
-        raise UsageError(message, hint=f"{self.prog} --help")
+        chosen = _INVALID_CHOICE.search(message)
+        if chosen is None:
+            raise UsageError(message.removeprefix("argument "), hint=f"{self.prog} --help")
+        where, got, choices = chosen[1], chosen[2], re.findall(r"[\w.-]+", chosen[3])
+        known = f"one of {', '.join(choices)}"
+        raise UsageError(f"{where}: expected {known}, got {got!r}", hint=_meant(got, choices, self.prog))
+
+
+_INVALID_CHOICE = re.compile(r"argument (.+): invalid choice: '?(.*?)'? \(choose from (.+)\)")
+
+
+def _meant(got: str, known: Iterable[str], program: str) -> str:
+    """Name what is spelt most like ``got``, or where to look."""
+    near = difflib.get_close_matches(got, list(known), n=1)
+    return f"{near[0]} instead; {program} --help lists all" if near else f"{program} --help"
+
+
+class _Program(_Parser):
+    """The parser above all commands; its help lists them in groups."""
+
+    commands: dict[str, Command]
+
+    def format_help(self) -> str:
+        groups = {title: [n for n in names if n in self.commands] for title, names in GROUPS.items()}
+        groups["more"] = sorted(set(self.commands).difference(*GROUPS.values()))
+        lines = ["usage: tofcapture COMMAND ...", "", *textwrap.wrap(DESCRIPTION, WIDTH)]
+        for title, names in groups.items():
+            lines += ["", f"{title}:"] if names else []
+            lines += [line for name in names for line in _wrapped(name, self.commands[name].help)]
+        lines += ["", "Every command has --help, with an example, and --json. See also --version."]
+        return "\n".join([*lines, *textwrap.wrap(EXIT_CODES, WIDTH, subsequent_indent="  "), ""])
+
+
+def _wrapped(name: str, text: str) -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent=f"  {name:<17} ", subsequent_indent=" " * 20)
 
 
 def _found() -> dict[str, EntryPoint]:
     found = {e.name: e for e in entry_points(group=GROUP)}
     if not found:
         raise ConfigError("no commands are registered", hint="install the package: pip install '.[all]'")
-    names = sorted(found, key=lambda name: (ORDER.index(name) if name in ORDER else len(ORDER), name))
+    order = [name for names in GROUPS.values() for name in names]
+    names = sorted(found, key=lambda name: (order.index(name) if name in order else len(order), name))
     return {name: found[name] for name in names}
 
 
@@ -64,14 +118,15 @@ def parser(commands: dict[str, Command], *, named: bool = True) -> argparse.Argu
 
     Not ``named``, only the list of commands is of use: no command declares arguments, for some import numpy for that.
     """
-    top = _Parser(prog="tofcapture", description=DESCRIPTION, epilog=EXIT_CODES)
+    top = _Program(prog="tofcapture")
+    top.commands = commands
     top.add_argument("--version", action="version", version=f"tofcapture {__version__}")
     subs = top.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     for name, command in commands.items():
         sub = subs.add_parser(
             name,
             help=command.help,
-            description=command.help,
+            description=textwrap.fill(command.help, WIDTH),
             epilog=f"example:\n  {command.example}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
@@ -84,6 +139,8 @@ def parser(commands: dict[str, Command], *, named: bool = True) -> argparse.Argu
 def _run(argv: Sequence[str]) -> Outcome:
     entries = _found()
     named = next((a for a in argv if not a.startswith("-")), None)
+    if named is not None and named not in entries:
+        raise UsageError(f"no command {named!r}", hint=_meant(named, entries, "tofcapture"))
     wanted = {named: entries[named]} if named in entries else entries
     top = parser({name: _load(entry) for name, entry in wanted.items()}, named=named in entries)
     args = top.parse_args(argv)

@@ -20,18 +20,17 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     add("recordings", nargs="+", type=Path, metavar="RECORDING", help="folders that record filled")
     add("--out", type=Path, required=True, metavar="DIR", help="the dataset's folder")
     which = "rig to use (default: RECORDING/rig.toml, written by align)"
-    rig.add_argument("--rig", type=Path, metavar="TOML", help=which)
+    rig.add_argument("--rig", type=Path, metavar="RIG.toml", help=which)
     which = "use the rig that the simulator knows (simulated recordings)"
     rig.add_argument("--true-rig", action="store_true", help=which)
     radius = "object within this radius, metres (default: 0.35)"
     add("--crop-radius", type=float, metavar="M", help=radius)
     add("--far", type=float, metavar="M", help="deepest ground truth, metres (default: 2.0)")
-    scales = (
-        "resolutions of the ground truth, in ToF images: 1 2 4 adds 4x (default: 1 2, which are always there)"
-    )
+    scales = "resolutions of the ground truth, in ToF images: 1 2 4 adds 4x (default: 1 2)"
     add("--scales", nargs="+", type=int, choices=(1, 2, 4), default=(1, 2), metavar="S", help=scales)
     add("--jobs", type=int, metavar="N", help="processes (default: one per core, at most 4)")
-    add("--engine", choices=("process", "dask"), default="process", help="who builds (default: process)")
+    engine = "who builds: process or dask (default: process)"
+    add("--engine", choices=("process", "dask"), default="process", metavar="ENGINE", help=engine)
     add("--scheduler", metavar="ADDRESS", help="of a Dask cluster, for example tcp://host:8786")
     part = "build part I of N of the scenes; the last to end finishes the dataset"
     batch.add_argument("--part", metavar="I/N", help=part)

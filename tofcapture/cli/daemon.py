@@ -15,11 +15,11 @@ from tofcapture.errors import ConfigError
 
 def _configure_daemon(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--root", type=Path, required=True, metavar="FOLDER", help="where recordings go")
+    add("--root", type=Path, required=True, metavar="DIR", help="where recordings go")
     address = "listen on loopback TCP too, for the page; port 0 takes a free one"
     add("--http", metavar="127.0.0.1:PORT", help=address)
-    add("--station", type=Path, metavar="TOML", help="devices to use (default: all simulated)")
-    add("--state", type=Path, metavar="FOLDER", help="the daemon's own folder: queue, token, socket")
+    add("--station", type=Path, metavar="STATION.toml", help="devices to use (default: all simulated)")
+    add("--state", type=Path, metavar="DIR", help="the daemon's own folder: queue, token, socket")
     add("--allow-motion", action="store_true", help="let a real arm move, while this daemon runs")
     add("--print-unit", action="store_true", help="print a systemd unit and end")
 
@@ -87,7 +87,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
 
 
 def _configure_stop(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--state", type=Path, metavar="FOLDER", help="the daemon's folder")
+    parser.add_argument("--state", type=Path, metavar="DIR", help="the daemon's folder")
 
 
 def _run_stop(args: argparse.Namespace) -> Outcome:

@@ -42,9 +42,9 @@ def _check(args: argparse.Namespace) -> Outcome:
 def _configure_pack(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", type=Path, metavar="DATASET", help="folder that build-dataset filled")
-    add("--split", default="train", help="train, val or test (default train)")
+    add("--split", default="train", metavar="SPLIT", help="train, val or test (default: train)")
     folder = "the cache's folder; completed if it exists"
-    add("--out", type=Path, required=True, metavar="CACHE", help=folder)
+    add("--out", type=Path, required=True, metavar="DIR", help=folder)
 
 
 def _pack(args: argparse.Namespace) -> Outcome:
@@ -70,10 +70,17 @@ def _pack(args: argparse.Namespace) -> Outcome:
 def _configure_export(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("path", type=Path, metavar="PATH", help="dataset or shard")
-    add("--format", required=True, choices=("ply", "png16", "mcap"), dest="kind")
+    add(
+        "--format",
+        required=True,
+        choices=("ply", "png16", "mcap"),
+        dest="kind",
+        metavar="FORMAT",
+        help="ply, png16 or mcap",
+    )
     add("--out", type=Path, required=True, metavar="DIR", help="folder; completed if it was begun")
-    step = "step of PNG depth (default 0.000125: up to 8.19 m; 0.0001 holds 6.55 m)"
-    add("--unit", type=float, default=1 / 8000, metavar="METRES", help=step)
+    step = "step of PNG depth up to 8.19 m (default: 0.000125)"
+    add("--unit", type=float, default=1 / 8000, metavar="M", help=step)
 
 
 def _export(args: argparse.Namespace) -> Outcome:

@@ -23,8 +23,8 @@ TRAINING_MINUTES = 3
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder (default demo-out)")
-    add("--seed", type=int, default=0, help="seed of the simulated station (default 0)")
+    add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder (default: demo-out)")
+    add("--seed", type=int, default=0, metavar="N", help="seed of the simulated station (default: 0)")
     instead = f"train a small network for {TRAINING_MINUTES} minutes instead of taking the bundled one"
     add("--train", action="store_true", help=instead)
 

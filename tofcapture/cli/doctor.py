@@ -273,9 +273,9 @@ def examine(examination: Examination) -> list[Finding]:
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--station", type=Path, metavar="TOML", help="look at its devices too, without opening them")
+    add("--station", type=Path, metavar="STATION.toml", help="look at its devices too, without opening them")
     add("--open", action="store_true", help="open the station's devices as well; nothing moves")
-    add("--folder", type=Path, default=Path(), help="where recordings would go (default: here)")
+    add("--folder", type=Path, default=Path(), metavar="DIR", help="where recordings would go (default: .)")
 
 
 def _run(args: argparse.Namespace) -> Outcome:

@@ -23,10 +23,10 @@ def _configure_view(parser: argparse.ArgumentParser) -> None:
     path = "recording, view file, dataset, shard, folder of predict, rig.toml or evidence.json"
     add("path", type=Path, metavar="PATH", help=path)
     sheet = "write a contact sheet; needs no screen and no Rerun"
-    how.add_argument("--png", type=Path, metavar="FILE", help=sheet)
+    how.add_argument("--png", type=Path, metavar="FILE.png", help=sheet)
     how.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a Rerun file and show nothing")
     how.add_argument("--web", action="store_true", help="show in a browser of this machine, not in a window")
-    most = f"show N views at most, spread evenly (default {_SHEET} for --png, else {_RERUN})"
+    most = f"show N views at most, spread evenly (default: {_SHEET} for --png, else {_RERUN})"
     add("--views", type=int, metavar="N", help=most)
 
 
@@ -69,10 +69,10 @@ def _configure_figure(parser: argparse.ArgumentParser) -> None:
     add("--scene", metavar="NAME", help="this scene (default: the first, or one a row)")
     view = "view N of a recording's scene or of a shard (default: the first)"
     add("--view", type=int, metavar="N", help=view)
-    add("--rows", type=int, metavar="N", help="depth, normals: N scenes at most (default 4)")
+    add("--rows", type=int, metavar="N", help="depth, normals: N scenes at most (default: 4)")
     folder = "depth, normals: folder that predict wrote, or one with SCENE-000/ of each scene"
     add("--prediction", type=Path, metavar="DIR", help=folder)
-    add("--rig", type=Path, metavar="FILE", help="preprocessing: rig.toml (default: the recording's)")
+    add("--rig", type=Path, metavar="RIG.toml", help="preprocessing: rig.toml (default: the recording's)")
 
 
 def _figure(args: argparse.Namespace) -> Outcome:
@@ -93,8 +93,8 @@ def _figure(args: argparse.Namespace) -> Outcome:
 def _configure_stats(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", type=Path, metavar="DATASET", help="folder that build-dataset filled")
-    page, text = Path("stats.html"), "write one self-contained page with pictures (default stats.html)"
-    add("--html", type=Path, nargs="?", const=page, metavar="FILE", help=text)
+    page, text = Path("stats.html"), "write one self-contained page with pictures (default: stats.html)"
+    add("--html", type=Path, nargs="?", const=page, metavar="FILE.html", help=text)
 
 
 def _stats(args: argparse.Namespace) -> Outcome:

@@ -31,16 +31,16 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--calibration", action="store_true", help="views of the calibration board, for align")
     into = "folder to record into; resumed when it exists"
     add("--out", type=Path, required=True, metavar="RECORDING", help=into)
-    number = f"number of views (default {_SCENE_VIEWS}, {_BOARD_VIEWS} for --calibration)"
-    add("--views", type=int, help=number)
-    add("--frames", type=int, default=10, help="ToF frames of each burst (default 10)")
-    add("--station", type=Path, metavar="TOML", help="devices to use (default: all simulated)")
-    add("--seed", type=int, help="seed of the simulated world and of the view plan")
-    turned = "have the object turned by hand between views, N ways in all (default 1: it stays)"
+    number = f"number of views (default: {_SCENE_VIEWS}, {_BOARD_VIEWS} for --calibration)"
+    add("--views", type=int, metavar="N", help=number)
+    add("--frames", type=int, default=10, metavar="N", help="ToF frames of each burst (default: 10)")
+    add("--station", type=Path, metavar="STATION.toml", help="devices to use (default: all simulated)")
+    add("--seed", type=int, metavar="N", help="seed of the simulated world and of the view plan")
+    turned = "have the object turned by hand between views, N ways in all (default: 1, it stays)"
     add("--turns", type=int, default=1, metavar="N", help=turned)
     add("--dry-run", action="store_true", help="print the plan and draw it; nothing moves or is recorded")
     drawn = "where --dry-run draws it (default: beside RECORDING)"
-    add("--picture", type=Path, metavar="SVG", help=drawn)
+    add("--picture", type=Path, metavar="FILE.svg", help=drawn)
     leave = "let a real arm move in this run (rehearse the plan first); simulated arms need no leave"
     add("--allow-motion", action="store_true", help=leave)
     add("--foreground", action="store_true", help="record here, also when a daemon keeps this recording")

@@ -79,8 +79,8 @@ def _configure_config(parser: argparse.ArgumentParser) -> None:
     add = parts.add_parser("show", help="print what holds", description="print what holds").add_argument
     add("--origin", action="store_true", help="say of each value where it comes from")
     station = "station (default: $TOFCAPTURE_STATION, else the simulated one)"
-    add("--station", type=Path, metavar="TOML", help=station)
-    add("--seed", type=int, help="as record takes it")
+    add("--station", type=Path, metavar="STATION.toml", help=station)
+    add("--seed", type=int, metavar="N", help="as record takes it")
     add("--json", action="store_true", help="print the result as one JSON object")
 
 
@@ -110,7 +110,7 @@ def _run_config(args: argparse.Namespace) -> Outcome:
 
 
 def _configure_completion(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("shell", choices=SHELLS, help="which shell the script is for")
+    parser.add_argument("shell", metavar="SHELL", choices=SHELLS, help="bash, zsh, tcsh or fish")
 
 
 def _run_completion(args: argparse.Namespace) -> Outcome:

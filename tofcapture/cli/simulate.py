@@ -21,7 +21,7 @@ def _configure_view(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="VIEW.h5", help=file)
     text = "no sensor imperfection, no quantisation; geometry, albedo and multipath stay"
     add("--ideal", action="store_true", help=text)
-    add("--frames", type=int, default=None, help="frames in the burst (default 10, ideal 1)")
+    add("--frames", type=int, metavar="N", help="frames in the burst (default: 10, ideal 1)")
 
 
 def _run_view(args: argparse.Namespace) -> Outcome:
@@ -52,23 +52,33 @@ def _configure_dataset(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     folder = "the dataset's folder; completed when it exists"
     add("--out", type=Path, required=True, metavar="DIR", help=folder)
-    add("--suite", default="tof100", metavar="NAME", help="tof100 (default), indoor, multipath or noise")
+    add(
+        "--suite",
+        default="tof100",
+        metavar="NAME",
+        help="tof100, indoor, multipath or noise (default: tof100)",
+    )
     for name, default, text in (
         ("--scenes", None, "scenes to simulate"),
-        ("--seed", 0, "seed of everything (default 0)"),
-        ("--views", 25, "views of each scene (default 25)"),
-        ("--frames", 10, "ToF frames of each view (default 10)"),
-        ("--cameras", 1, "rigs that the scenes take turns with (default 1)"),
-        ("--jobs", None, "processes (default one per core)"),
+        ("--seed", 0, "seed of everything (default: 0)"),
+        ("--views", 25, "views of each scene (default: 25)"),
+        ("--frames", 10, "ToF frames of each view (default: 10)"),
+        ("--cameras", 1, "rigs that the scenes take turns with (default: 1)"),
+        ("--jobs", None, "processes (default: one per core)"),
     ):
         add(name, type=int, metavar="N", default=default, required=name == "--scenes", help=text)
     kinds = "object, combination, concave, corner, bright, dark, mesh"
     text = f"kinds of scenes, in turns, instead of the recipe's (tof100): {kinds}"
     add("--kinds", nargs="+", default=(), metavar="KIND", help=text)
     add("--meshes", type=Path, metavar="DIR", help="meshes for a tenth of the scenes (tof100)")
-    add("--mesh-unit", default="mm", help="unit of the meshes: m, cm or mm (default mm)")
-    add("--station", type=Path, metavar="TOML", help="take the simulator's constants from its [sim]")
-    add("--split", choices=("train", "val", "test"), help="of every scene (default: by their objects)")
+    add("--mesh-unit", default="mm", metavar="UNIT", help="of the meshes: m, cm or mm (default: mm)")
+    add("--station", type=Path, metavar="STATION.toml", help="take the simulator's constants from its [sim]")
+    add(
+        "--split",
+        metavar="SPLIT",
+        choices=("train", "val", "test"),
+        help="train, val or test, of every scene (default: by their objects)",
+    )
 
 
 def _run_dataset(args: argparse.Namespace) -> Outcome:
