@@ -10,15 +10,12 @@ import argparse
 import importlib.util
 import os
 import re
-from importlib.metadata import entry_points
 from pathlib import Path
 
-from tofcapture.cli import GROUP, ORDER
-from tofcapture.cli.kit import Command
+from tofcapture.cli import EXIT_CODES, GROUPS, all_commands, parser
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("tofcapture", "calibration", "tofcapture_model")
-WIDTH = "96"  # columns of help texts
 _HEAVY = (
     "open3d", "kiss_icp", "cv2", "scipy", "torch", "numba", "matplotlib", "rich", "tomli_w", "jinja2", "safetensors", "small_gicp",
     "aiohttp", "distributed", "serial", "nxlib", "rerun", "tensorboard", "threadpoolctl", "rtde_control", "rtde_receive", "ArducamDepthCamera",
@@ -27,51 +24,45 @@ _HEAVY = (
 ABSENT = [name for name in _HEAVY if importlib.util.find_spec(name) is None]
 
 
-def commands() -> dict[str, Command]:
-    """Every command by name, in the order of ``tofcapture --help``."""
-    found = {e.name: e.load() for e in entry_points(group=GROUP)}
-    return {n: found[n] for n in sorted(found, key=lambda n: (ORDER.index(n) if n in ORDER else 99, n))}
-
-
-def _parts(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.ArgumentParser]]:
+def _parts(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     groups = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]  # noqa: SLF001  argparse has no other way
-    return [(name, sub) for group in groups for name, sub in group.choices.items()]
+    return {name: sub for group in groups for name, sub in group.choices.items()}
 
 
-def _help(parser: argparse.ArgumentParser) -> str:
-    text = parser.format_help()
-    return f"```text\n{text.rstrip()}\n```\n"
+def _parsers() -> dict[str, argparse.ArgumentParser]:
+    """Return every command's own parser, and those of its parts, by what is typed."""
+    tops = _parts(parser(all_commands()))
+    found = {}
+    for name, top in tops.items():
+        found |= {name: top, **{f"{name} {part}": sub for part, sub in _parts(top).items()}}
+    return found
 
 
 def commands_page() -> str:
-    """``reference/commands.md``."""
-    os.environ.update(COLUMNS=WIDTH, NO_COLOR="1")
+    """``reference/commands.md``: the groups of ``tofcapture --help``, each command with its help."""
+    os.environ.update(COLUMNS="80", NO_COLOR="1")
+    found, commands = _parsers(), all_commands()
     lines = [
-        "# Commands\n\nGenerated from the commands' own help. Every command takes `--json` and prints one object then; results go to",
-        "stdout, progress and errors to stderr. Exit codes: 0 ok, 1 unexpected, 2 usage, 3 config, 4 device, 5 data, 6 quality gate,",
-        "7 busy, 130 interrupted.\n",
+        "# Commands",
+        "",
+        "Every command has `--help` and `--json`; results go to stdout, progress and errors to stderr.",
+        "",
+        EXIT_CODES + ".",
+        "",
     ]
-    for name, command in commands().items():
-        parser = argparse.ArgumentParser(
-            prog=f"tofcapture {name}",
-            description=command.help,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        command.configure(parser)
-        parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
-        lines.append(
-            f"## {name}\n\n{command.help[0].upper()}{command.help[1:]}.\n\n```sh\n{command.example}\n```\n\n{_help(parser)}"
-        )
-        lines += [f"### {name} {part}\n\n{_help(sub)}" for part, sub in _parts(parser)]
+    for title, names in GROUPS.items():
+        lines += [f"## {title.capitalize()}", ""]
+        for name in (n for n in found if n.partition(" ")[0] in names):
+            example = [] if " " in name else ["```sh", commands[name].example, "```", ""]
+            body = found[name].format_help().partition("\nexample:")[0].rstrip()
+            lines += [f"### {name}", "", *example, "```text", body, "```", ""]
     return "\n".join(lines)
 
 
-def options_of(command: Command) -> set[str]:
+def options_of(name: str) -> set[str]:
     """Every long option of a command and of its parts."""
-    parser = argparse.ArgumentParser()
-    command.configure(parser)
-    parsers = [parser, *(sub for _, sub in _parts(parser))]
-    return {o for p in parsers for o in p._option_string_actions if o.startswith("--")} | {"--json"}  # noqa: SLF001
+    parsers = [p for typed, p in _parsers().items() if typed.partition(" ")[0] == name]
+    return {o for p in parsers for o in p._option_string_actions if o.startswith("--")}  # noqa: SLF001
 
 
 def modules() -> dict[str, list[str]]:

@@ -139,7 +139,9 @@ def _train(args: argparse.Namespace) -> Outcome:
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", type=Path, metavar="DATASET", help="folder that build-dataset filled")
-    weights = "checkpoint or run's folder (default: the bundled weights); with --suite, NAME=PATH of several"
+    weights = (
+        "checkpoint or folder of a run, with --suite NAME=PATH of several (default: the bundled weights)"
+    )
     add("--weights", nargs="+", metavar="WEIGHTS", help=weights)
     suites = f"tables of several methods beside --out, resumable: {', '.join(SUITES)} or all"
     add("--suite", choices=(*SUITES, "all"), metavar="NAME", help=suites)
