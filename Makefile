@@ -1,4 +1,4 @@
-# Two commands do everything on a fresh Debian or Ubuntu with Python 3.11 and make:
+# Two commands do everything on a fresh Debian or Ubuntu with Python 3.11 to 3.13 and make:
 #   make demo   installs into .venv and runs the whole way on the simulated station
 #   make test   installs into .venv and runs the tests
 
@@ -6,19 +6,27 @@ PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-# A GPU build of torch is gigabytes. Where there is no NVIDIA driver and pip would find only that one, name the CPU build:
+# torch: pip brings the build for CUDA on most systems, 5 GB with its libraries. Where there is no GPU, name the CPU build:
 # make demo TORCH="torch==2.13.0 --index-url ..." with the address that PyTorch's install page gives.
 TORCH ?= $(shell command -v nvidia-smi >/dev/null 2>&1 && echo "torch" || echo "torch==2.13.0")
 
 .PHONY: demo test lint docs gpu clean
 .DELETE_ON_ERROR:
 
+# What pip cannot find is said in the first line, its own words after it.
+PIP = $(VENV)/bin/python -m pip install --quiet
+LOG := $(VENV)/install.log
+SYSTEM = $$($(PYTHON) -c "import platform as p; print('Python', p.python_version(), 'on', p.machine(), *p.libc_ver())")
+MISSING = { sed -n "s/.*No matching distribution found for \(.*\)/no wheel of \1 for $(SYSTEM)/p" $(LOG) | head -1; cat $(LOG); exit 1; }
+
 $(STAMP): pyproject.toml
-	$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'tofcapture needs Python 3.11 or newer')"
+	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'tofcapture needs Python 3.11 or newer: make PYTHON=python3.13')"
+	@$(PYTHON) -c "import ensurepip" 2>/dev/null || { echo "this Python has no venv: apt-get install python3-venv"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)/bin/python -m pip install --quiet $(TORCH)
-	$(VENV)/bin/python -m pip install --quiet -e ".[all]" --group dev --group docs
+	$(PIP) --upgrade pip
+	$(PIP) $(TORCH) >$(LOG) 2>&1 || $(MISSING)
+	$(PIP) -e ".[all]" --group dev --group docs >$(LOG) 2>&1 || $(MISSING)
+	@$(PIP) --only-binary ur-rtde -e ".[ur]" 2>/dev/null || echo "left out: ur-rtde has no wheel for $(SYSTEM); tests of the UR arm skip (docs/ur.md)"
 	touch $(STAMP)
 
 demo: $(STAMP)

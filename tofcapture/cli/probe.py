@@ -22,6 +22,7 @@ from tofcapture.cli.kit import Command
 from tofcapture.errors import TofError
 
 _RTDE = ("rtde_control", "rtde_receive", "rtde_io", "dashboard_client")
+_UR_ARMS = "arms of Universal Robots (newer than Python 3.12: apt-get install cmake libboost-all-dev first)"
 
 
 @dataclass(frozen=True)
@@ -84,9 +85,9 @@ def _end(done: subprocess.CompletedProcess[str]) -> str:
     return f"ended with {done.returncode}: {last}"
 
 
-def _import(name: str, modules: tuple[str, ...], cameras: str) -> Finding:
+def _import(name: str, modules: tuple[str, ...], extra: str, use: str) -> Finding:
     """Import modules; missing is a warning, broken a failure."""
-    advice = f"pip install 'tofcapture[hardware]', for {cameras}"
+    advice = f"pip install 'tofcapture[{extra}]', for {use}"
     if (found := installed_version(name)) is None:
         return graded(name, "not installed", advice)
     try:
@@ -107,7 +108,7 @@ def probe_open3d() -> Iterator[Finding]:
 
 def probe_nxlib() -> Iterator[Finding]:
     """Load the Ensenso client, and the SDK behind it."""
-    found = _import("nxlib", ("nxlib",), "Ensenso cameras")
+    found = _import("nxlib", ("nxlib",), "ensenso", "Ensenso cameras")
     yield found
     if found.verdict == "PASS":
         yield attempt("Ensenso SDK", _load_ensenso, "WARN")
@@ -219,7 +220,7 @@ def _probe_rig(context: Any) -> Iterator[Finding]:
 
 PROBES: dict[str, Callable[..., Iterator[Finding]]] = {
     "open3d": probe_open3d,
-    "ur-rtde": lambda: iter([_import("ur-rtde", _RTDE, "arms of Universal Robots")]),
+    "ur-rtde": lambda: iter([_import("ur-rtde", _RTDE, "ur", _UR_ARMS)]),
     "nxlib": probe_nxlib,
     "drivers": probe_drivers,
     "commands": probe_commands,

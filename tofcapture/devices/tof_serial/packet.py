@@ -22,7 +22,7 @@ try:
 except ImportError as err:
     raise ConfigError(
         f"the driver tof_serial needs the Python package cobs: {err}",
-        hint="pip install 'tofcapture[hardware]'",
+        hint="pip install 'tofcapture[serial]'",
     ) from err
 
 PROTOCOL = 1

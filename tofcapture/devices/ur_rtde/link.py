@@ -260,7 +260,7 @@ def _connect(host: str, variables: list[str]) -> tuple[Any, Any]:
         import rtde_receive
     except ImportError as err:
         raise ConfigError(
-            f"the ur_rtde library does not load: {err}", hint="pip install 'tofcapture[hardware]'"
+            f"the ur_rtde library does not load: {err}", hint="pip install 'tofcapture[ur]'"
         ) from err
     # A constructor that hangs cannot be asked where; this is what the station then finds.
     print(
