@@ -7,7 +7,8 @@ The worker's environment: ``BENCH_DELAY`` seconds per device step, ``BENCH_LOG``
 ``BENCH_ASKS`` set: a person must confirm the scene; ``BENCH_HOST`` set: the arm has a driver host; ``BENCH_LARGE`` set: images of full size;
 ``BENCH_REAL`` set: the arm is a real one; ``BENCH_HOLD`` a file: while it exists, the device step whose number stands in it waits, until
 the arm is stopped. The daemon's: ``BENCH_LOST`` seconds of silence after which a recorder is killed,
-``BENCH_IDLE`` seconds that a connection may take.
+``BENCH_IDLE`` seconds that a connection may take. ``BENCH_SCOPE`` names what ``tofcapture stop`` of a test stops.
+``BENCH_REAL`` with ``BENCH_MOVES``: the daemon was started with --allow-motion.
 """
 
 from __future__ import annotations
@@ -282,11 +283,19 @@ def _few_candidates() -> None:
     plan.object_sampling = lambda: few
 
 
+def _scope() -> None:
+    """Be heard by those who stop what is of this scope, and by nobody else."""
+    from tofcapture.record import stopping
+
+    stopping.PREFIX = os.environ.get("BENCH_SCOPE", stopping.PREFIX)
+
+
 def worker(station: str) -> None:
     """Run the recorder's process on this station."""
     from tofcapture.devices import station as stations
     from tofcapture.record.daemon import worker as real
 
+    _scope()
     if station == "arrays":
         stations.open_station = _open_arrays
     if "BENCH_HOST" in os.environ:
@@ -305,13 +314,14 @@ def daemon(args: argparse.Namespace) -> None:
     from tofcapture.record.daemon.server import serve, tcp_address
     from tofcapture.record.daemon.settings import Settings, open_folder
 
+    _scope()
     guard.IDLE = float(os.environ.get("BENCH_IDLE", guard.IDLE))
     args.root.mkdir(parents=True, exist_ok=True)
     toml = None if args.station == "arrays" else Path(args.station)
     lost = float(os.environ.get("BENCH_LOST", "20"))
     command = (sys.executable, __file__, "worker", "--station", args.station)
     settings = Settings(
-        args.root.resolve(), open_folder(args.state), toml, worker=command, silence_limit=lost
+        args.root.resolve(), open_folder(args.state), toml, "BENCH_MOVES" in os.environ, command, lost
     )
     serve(settings, tcp_address(args.http) if args.http else None, lambda url: print(url, flush=True))
 

@@ -263,11 +263,90 @@ def test_stop_keeps_what_is_sealed(tmp_path):
         assert daemon.wait(lambda s: s["queue"].get("done") == 1)["progress"]["sealed"] == 5
 
 
+def test_an_ended_job_is_tried_again(tmp_path):
+    """Retry asks for the same once more, and keeps what was; what has not ended cannot be tried again."""
+    with running(tmp_path, **_held(tmp_path, 4)) as daemon:
+        first = daemon.record(3, seed=5)
+        daemon.wait(lambda s: s["progress"]["sealed"] == 1)
+        with pytest.raises(BusyError):
+            daemon.ask("POST", f"/v1/jobs/{first['id']}/retry")
+        daemon.ask("POST", "/v1/stop")
+        daemon.wait(_over)
+        (tmp_path / "hold").unlink()
+        again = daemon.ask("POST", f"/v1/jobs/{first['id']}/retry")
+        assert {k: again[k] for k in ("scene", "views", "frames", "seed")} == {
+            k: first[k] for k in ("scene", "views", "frames", "seed")
+        }
+        daemon.ask("POST", "/v1/resume")
+        daemon.wait(lambda s: s["queue"].get("done"))
+        jobs = daemon.ask("GET", "/v1/jobs")["jobs"]
+        assert [(job["id"], job["state"], job["reason"]) for job in jobs] == [
+            (again["id"], "done", ""),
+            (first["id"], "stopped", "stopped by the operator"),
+        ]
+
+
+def test_jobs_are_reordered_and_told_in_their_order(tmp_path):
+    """The list is the running one, those that wait in the order in which they will run, then those that ended."""
+    with running(tmp_path) as daemon:
+        daemon.ask("POST", "/v1/pause")
+        a, b, c = (daemon.record(1, scene=name)["id"] for name in "abc")
+        daemon.ask("POST", f"/v1/jobs/{c}/move", {"place": 1})
+        daemon.ask("POST", f"/v1/jobs/{a}/cancel")
+        assert [job["id"] for job in daemon.ask("GET", "/v1/jobs")["jobs"]] == [c, b, a]
+        with pytest.raises(BusyError):
+            daemon.ask("POST", f"/v1/jobs/{a}/move", {"place": 1})
+        daemon.ask("POST", "/v1/resume")
+        daemon.wait(lambda s: s["queue"].get("done") == 2)
+        told = [e for e in daemon.ask("GET", "/v1/log")["events"] if e["event"] == "planned"]
+        assert [e["job"] for e in told] == [c, b]
+
+
+def test_one_view_is_taken_again(tmp_path):
+    """It alone; the one before lies beside it. A view that is not planned is no view."""
+    with running(tmp_path) as daemon:
+        daemon.record(3)
+        daemon.wait(_over)
+        folder = tmp_path / "root" / "r" / "views" / "mug"
+        before = {path.name: path.read_bytes() for path in folder.glob("view-*.h5")}
+        daemon.record(3, retake=1)
+        daemon.wait(lambda s: s["queue"].get("done") == 2)
+        after = {path.name: path.read_bytes() for path in folder.glob("view-*.h5*")}
+        assert after.pop("view-001.h5.retaken") == before["view-001.h5"]
+        assert {name for name in before if after[name] != before[name]} == {"view-001.h5"}
+        assert read_view(folder / "view-001.h5").index == 1
+        daemon.record(3, retake=7)
+        daemon.wait(lambda s: s["queue"].get("failed"))
+        assert "retake" in daemon.ask("GET", "/v1/jobs")["jobs"][0]["reason"]
+
+
+def test_what_moves_a_real_arm_wants_its_reach_clear(tmp_path):
+    """Adding, resuming, confirming, trying again: none of it without a word that everybody is out of reach."""
+    with running(tmp_path, BENCH_REAL=1, BENCH_MOVES=1, BENCH_ASKS=1) as daemon:
+        job = {"scene": "mug", "recording": "r", "views": 1, "frames": 1}
+        daemon.ask(
+            "POST", "/v1/jobs", {**job, "clear": True}
+        )  # after it the daemon knows that the arm is real
+        daemon.wait(lambda s: s["phase"] == "waiting")
+        assert daemon.ask("GET", "/v1/state")["real"] is True
+        ways = [("/v1/jobs", job), ("/v1/confirm", {}), ("/v1/resume", {}), ("/v1/resume", {"clear": False})]
+        for path, body in ways:
+            with pytest.raises(UsageError, match="clear"):
+                daemon.ask("POST", path, body)
+        daemon.ask("POST", "/v1/confirm", {"clear": True})
+        done = daemon.wait(_over)["job"]
+        with pytest.raises(UsageError, match="clear"):
+            daemon.ask("POST", f"/v1/jobs/{done['id']}/retry")
+        assert len(daemon.ask("GET", "/v1/jobs")["jobs"]) == 1
+        daemon.ask("POST", f"/v1/jobs/{done['id']}/retry", {"clear": True})
+
+
 def test_a_person_is_asked_for_the_scene(tmp_path):
     """Where a person places scenes, the recorder waits for a confirmation."""
     with running(tmp_path, BENCH_ASKS=1) as daemon:
         daemon.record(2)
-        assert daemon.wait(lambda s: s["asks"])["asks"] == "mug"
+        state = daemon.wait(lambda s: s["asks"])
+        assert (state["asks"], state["phase"]) == ("mug", "waiting")
         daemon.ask("POST", "/v1/confirm")
         assert daemon.wait(_over)["job"]["state"] == "done"
 
@@ -353,6 +432,7 @@ WRONG_JOBS = [
     ("unknown field", json.dumps({**GOOD, "station": "/etc/passwd"}), 422),
     *((f"scene {name!r}", json.dumps({**GOOD, "scene": name}), 422) for name in ("../../etc", "a\n", "")),
     *((f"recording {name!r}", json.dumps({**GOOD, "recording": name}), 422) for name in ("../b", "/etc", 3)),
+    ("a word for consent", json.dumps({**GOOD, "clear": "yes"}), 422),
     *((f"views {n!r}", json.dumps({**GOOD, "views": n}), 422) for n in (True, 0, 1001, 1.5, "3", None)),
 ]
 FORM = {**VERB, "Content-Type": "application/x-www-form-urlencoded"}

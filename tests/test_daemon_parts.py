@@ -1,5 +1,6 @@
 """Parts of the daemon by themselves: pictures, queue, addresses, what systemd hears, what counts as a full disk."""
 
+import contextlib
 import errno
 import os
 import signal
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests import PATIENCE
+from tests.sealed import simulate
 from tests.test_daemon_api import STATION
 from tofcapture.cli import main
 from tofcapture.colours import GREY
@@ -23,17 +25,25 @@ from tofcapture.record.resources import is_full
 cv2 = pytest.importorskip("cv2")
 
 
-def test_pictures_show_near_far_and_nothing():
-    """Near is dark, far is bright, nothing is grey; all nothing and all the same are no errors; large ones are thinned."""
-    depth = np.linspace(0.5, 1.5, 100)[None].repeat(4, axis=0)
-    depth[:, 50] = np.nan
-    shown = _decoded(worker.picture("depth", depth))
-    assert shown.shape == (4, 100, 3)
-    assert shown[0, 1].sum() < shown[0, 40].sum() < shown[0, 98].sum()
-    assert (shown[:, 50] == GREY).all()
-    assert (_decoded(worker.picture("depth", np.full((3, 3), np.nan))) == GREY).all()
-    assert _decoded(worker.picture("amplitude", np.ones((3, 3)))).shape == (3, 3, 3)
-    assert max(_decoded(worker.picture("depth", np.ones((1024, 1280)))).shape) <= 320
+def test_pictures_show_near_far_and_nothing(tmp_path):
+    """Near is dark, far is bright, nothing is grey; large ones are thinned; both depths have one scale, in metres."""
+    view = simulate("box", 0)
+    view.stereo.points[..., 2] = np.linspace(0.5, 1.5, view.stereo.points.shape[1])
+    view.stereo.points[:, :20] = np.nan
+    scales = worker.save(view, tmp_path)
+    shown = _decoded((tmp_path / "stereo.png").read_bytes())
+    assert max(shown.shape) <= 320
+    assert (shown[:, 0] == GREY).all()
+    row = shown[1].sum(axis=1)
+    assert row[21] < row[30] < row[50]
+    assert scales["depth"] == scales["stereo"] != scales["amplitude"]
+    low, high = float(scales["depth"]["ticks"][0]), float(scales["depth"]["ticks"][-1])
+    assert (scales["depth"]["unit"], len(scales["depth"]["ticks"]), len(scales["depth"]["colours"])) == (
+        "m",
+        5,
+        9,
+    )
+    assert 0.3 < low < 0.8 < high < 1.5
 
 
 def _decoded(png):
@@ -50,6 +60,77 @@ def test_the_oldest_events_go(tmp_path, monkeypatch):
     queue = store.Store(tmp_path / "q")
     assert queue.remember("log", {}).id == queue.last_event() == 1000
     assert [event.id for event in queue.events(0)] == list(range(701, 1001))
+    queue.close()
+
+
+def _asked(queue, *scenes):
+    return [queue.add({"recording": "r", "scene": s, "views": 2, "frames": 1})[0].id for s in scenes]
+
+
+def _waiting(queue):
+    return "".join(job.scene for job in queue.ahead())
+
+
+def test_waiting_jobs_take_another_place(tmp_path):
+    """Any place, any number of times; what comes later comes last, what is put back comes first; others do not move."""
+    queue = store.Store(tmp_path / "q")
+    a, b, _, d = _asked(queue, *"abcd")
+    for number, place, order in ((d, 1, "dabc"), (d, 2, "adbc"), (a, 99, "dbca"), (b, 2, "dbca")):
+        queue.reorder(number, place)
+        assert _waiting(queue) == order
+    _asked(queue, "e")
+    assert _waiting(queue) == "dbcae"
+    queue.move(d, "running")
+    queue.reorder(a, 1)
+    assert _waiting(queue) == "dabce"
+    queue.move(d, "queued")
+    assert queue.next().scene == "d"
+    queue.move(d, "done")
+    for number, error in ((d, BusyError), (99, DataError)):
+        with pytest.raises(error):
+            queue.reorder(number, 1)
+    assert _waiting(queue) == "abce"
+    assert [job.scene for job in queue.ended()] == ["d"]
+    queue.close()
+
+
+def test_the_longest_queue_can_be_reordered(tmp_path, monkeypatch):
+    """As many jobs as may wait; all of them are listed."""
+    queue = store.Store(tmp_path / "q")
+    with contextlib.closing(sqlite3.connect(tmp_path / "q")) as other, other:
+        other.executemany(
+            "INSERT INTO jobs (recording, scene, views, frames, state, utc, changed_utc) VALUES ('r', ?, 1, 1, 'queued', '', '')",
+            [(str(n),) for n in range(store.MOST_WAITING)],
+        )
+    queue.reorder(1000, 1)
+    assert [job.id for job in queue.ahead()] == [1000, *range(1, 1000)]
+    queue.close()
+
+
+def test_a_queue_of_an_earlier_version_is_taken_over(tmp_path):
+    """Its jobs are there, in their order."""
+    old = sqlite3.connect(tmp_path / "q")
+    old.executescript(store._SCHEMA.replace(" retake INTEGER, place INTEGER,", ""))
+    old.execute(
+        "INSERT INTO jobs (recording, scene, views, frames, state, utc, changed_utc) VALUES ('r', 's', 1, 1, 'queued', '', '')"
+    )
+    old.commit()
+    old.close()
+    queue = store.Store(tmp_path / "q")
+    assert (queue.next().scene, queue.next().retake) == ("s", None)
+    queue.close()
+
+
+def test_the_log_is_of_the_last_hours(tmp_path):
+    """Oldest first, without single steps and without what is older, the newest when there are too many."""
+    queue = store.Store(tmp_path / "q")
+    with contextlib.closing(sqlite3.connect(tmp_path / "q")) as other, other:
+        other.executemany(
+            "INSERT INTO events (utc, kind, data) VALUES (?, ?, '{}')",
+            [("2026-01-01T00:00:00+00:00", "log"), ("2026-01-02T00:00:00+00:00", "step")]
+            + [("2026-01-02T00:00:00+00:00", "log")] * 501,
+        )
+    assert [event.id for event in queue.log("2026-01-01T12:00:00+00:00")] == list(range(4, 504))
     queue.close()
 
 
@@ -184,9 +265,8 @@ def test_motion_is_allowed_by_a_person_only(tmp_path, monkeypatch, flags):
 
 
 def test_cli_without_a_daemon(tmp_path, capsys):
-    """``status`` and ``stop`` say that no daemon runs; the unit allows no motion."""
+    """``status`` says that no daemon runs; the unit allows no motion."""
     assert main(["status", "--state", str(tmp_path)]) == 4
-    assert main(["stop", "--state", str(tmp_path)]) == 4
     assert "start one" in capsys.readouterr().err
     assert main(["daemon", "--root", str(tmp_path), "--state", str(tmp_path / "s"), "--print-unit"]) == 0
     unit = capsys.readouterr().out

@@ -10,7 +10,7 @@ from typing import Any
 
 from tofcapture.cli.kit import Command, Outcome
 from tofcapture.cli.setup import station_path
-from tofcapture.errors import ConfigError
+from tofcapture.errors import ConfigError, DeviceError, TofError
 
 
 def _configure_daemon(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +52,7 @@ def _announce(socket: Path, url: str | None) -> None:
 
 
 def _configure_status(parser: argparse.ArgumentParser) -> None:
-    _configure_stop(parser)
+    _configure_state(parser)
     parser.add_argument("--url", action="store_true", help="print the address of its page, token included")
 
 
@@ -86,19 +86,36 @@ def _lines(found: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _configure_stop(parser: argparse.ArgumentParser) -> None:
+def _configure_state(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--state", type=Path, metavar="DIR", help="the daemon's folder")
 
 
 def _run_stop(args: argparse.Namespace) -> Outcome:
     from tofcapture.record.daemon.client import ask
+    from tofcapture.record.daemon.settings import state_folder
+    from tofcapture.record.resources import holder
+    from tofcapture.record.stopping import Told, stop_all
 
-    found = ask("POST", "/v1/stop", state=args.state)
-    job = found["job"]
-    running = job and job["state"] == "running"
-    what = f"job {job['id']} ({job['scene']}) is given up" if running else "nothing was running"
-    text = f"the daemon rests, {what}; sealed views stay. tofcapture status shows the rest."
-    return Outcome(data={"ok": True, **found}, text=text)
+    try:
+        told = stop_all()
+    except OSError as err:
+        told = [Told(os.getpid(), "recorders", f"cannot be found on this system: {err}")]
+    state = state_folder(args.state)
+    # A daemon in a container of its own shares nothing but its folder with us.
+    if (daemon := holder(state.lock)) is not None and daemon not in {one.pid for one in told}:
+        try:
+            found = ask("POST", "/v1/stop", state=args.state)
+            told.append(Told(found["pid"], f"the daemon over {found['root']}, which rests", ""))
+        except TofError as err:
+            told.append(Told(daemon, f"the daemon of {state.root}", err.message))
+    lines = [str(one) for one in told] or ["no recorder and no daemon of this user runs"]
+    if not told or any(one.problem for one in told):
+        raise DeviceError(
+            "; ".join(["NOT STOPPED" if told else "nothing was stopped", *lines]),
+            hint="if an arm moves, press the red button: the emergency stop on its teach pendant",
+        )
+    lines.append("sealed views stay")
+    return Outcome(data={"ok": True, "stopped": [vars(one) for one in told]}, text="\n".join(lines))
 
 
 DAEMON = Command(
@@ -114,8 +131,8 @@ STATUS = Command(
     run=_run_status,
 )
 STOP = Command(
-    help="stop the arm now and give the daemon's job up; sealed views stay",
+    help="stop every recorder of this user now, with or without a daemon; sealed views stay",
     example="tofcapture stop",
-    configure=_configure_stop,
+    configure=_configure_state,
     run=_run_stop,
 )

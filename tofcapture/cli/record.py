@@ -39,6 +39,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     turned = "have the object turned by hand between views, N ways in all (default: 1, it stays)"
     add("--turns", type=int, default=1, metavar="N", help=turned)
     add("--dry-run", action="store_true", help="print the plan and draw it; nothing moves or is recorded")
+    again = "take view N again, and no other; the one before is kept beside it"
+    add("--retake", type=int, metavar="N", help=again)
     drawn = "where --dry-run draws it (default: beside RECORDING)"
     add("--picture", type=Path, metavar="FILE.svg", help=drawn)
     leave = "let a real arm move in this run (rehearse the plan first); simulated arms need no leave"
@@ -52,6 +54,7 @@ def _run(args: argparse.Namespace) -> Outcome:
     from tofcapture.record.plan import plan_scene
     from tofcapture.record.recorder import record
     from tofcapture.record.resources import check_motion_allowed
+    from tofcapture.record.stopping import stoppable
 
     scene = CALIBRATION if args.calibration else args.scene
     station_file = station_path(args.station)[0]
@@ -59,7 +62,11 @@ def _run(args: argparse.Namespace) -> Outcome:
     here = args.dry_run or args.foreground or station_file is not None or args.turns != 1
     if not here and (handed := _handed_over(args, scene, views)):
         return handed
-    with open_station(station_file, args.seed, allow_motion=args.allow_motion) as station:
+    with (
+        stoppable(f"{scene} into {args.out}") as stop,
+        open_station(station_file, args.seed, allow_motion=args.allow_motion) as station,
+    ):
+        stop.check()
         if args.dry_run:
             return _planned(args, scene, station, plan_scene(station, scene, views, args.turns))
         hint = "look at --dry-run, clear the workspace, then add --allow-motion"
@@ -67,7 +74,9 @@ def _run(args: argparse.Namespace) -> Outcome:
         meter = _BoardMeter(station) if args.calibration else None
         with progress() as report:
             tell = partial(report, f"record {scene}")
-            result = record(station, scene, args.out, views, args.frames, tell, meter, args.turns)
+            result = record(
+                station, scene, args.out, views, args.frames, tell, meter, args.turns, args.retake
+            )
     return _recorded(args.out, result)
 
 
@@ -103,9 +112,8 @@ def _handed_over(args: argparse.Namespace, scene: str, views: int) -> Outcome | 
     """Give the work to the daemon that keeps this recording; ``None`` when there is none."""
     from tofcapture.record.daemon.client import hand_over
 
-    request = {"scene": scene, "views": views, "frames": args.frames}
-    if args.seed is not None:
-        request["seed"] = args.seed
+    request = {"scene": scene, "views": views, "frames": args.frames, "clear": args.allow_motion}
+    request |= {key: n for key in ("seed", "retake") if (n := getattr(args, key)) is not None}
     job = hand_over(args.out, request)
     if job is None:
         return None

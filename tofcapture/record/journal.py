@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 import sqlite3
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture.errors import ConfigError, DataError
-from tofcapture.files.seal import sealed_digest
+from tofcapture.files.seal import replacing, sealed_digest
 from tofcapture.files.view import read_view, view_path
 from tofcapture.record.resources import is_full
 
@@ -223,10 +224,19 @@ def _adopt(journal: Journal, path: Path, scene: str, index: int) -> str:
 
 def _set_aside(path: Path) -> Path:
     """Rename a file; nothing is ever deleted that might be data."""
-    aside = path.with_name(f"{path.name}.damaged")
+    return path.rename(_free_name(path, "damaged"))
+
+
+def keep_copy(path: Path, why: str) -> None:
+    """Copy a view file to ``view-007.h5.WHY`` before another one takes its place."""
+    with replacing(_free_name(path, why)) as partial:
+        shutil.copyfile(path, partial)
+
+
+def _free_name(path: Path, why: str) -> Path:
+    aside = path.with_name(f"{path.name}.{why}")
     for number in itertools.count(2):
         if not aside.exists():
             break
-        aside = path.with_name(f"{path.name}.damaged-{number}")
-    path.rename(aside)
+        aside = path.with_name(f"{path.name}.{why}-{number}")
     return aside

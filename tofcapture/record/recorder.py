@@ -20,11 +20,12 @@ from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 from tofcapture.files.seal import write_text
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, TofBurst, View
-from tofcapture.record.journal import Journal, reconcile, utc_now
+from tofcapture.record.journal import Journal, keep_copy, reconcile, utc_now
 from tofcapture.record.observer import Observer
 from tofcapture.record.plan import Plan, PlannedView, plan_scene
 from tofcapture.record.quality import REFUSE, RETAKE, broken_limits, measure, quality_table
 from tofcapture.record.resources import check_space, full_disk_named, hold_arm, hold_file
+from tofcapture.record.stopping import Stop, stoppable
 
 ATTEMPTS = 3  # at one view
 FAILURES_IN_A_ROW = 2  # that end the run: that is no bad pose, that is a broken device
@@ -55,6 +56,7 @@ def record(
     progress: Progress | None = None,
     observer: Observer | None = None,
     turns: int = 1,
+    retake: int | None = None,
 ) -> RecordResult:
     """Take every missing view of one scene.
 
@@ -71,11 +73,13 @@ def record(
         Called with (views there, views planned) before the first and after each view.
     observer
         Looks on; may make the recorder wait between views, or end it.
+    retake
+        Number of a view to take again, and no other. The one before is set aside when the new one is there.
 
     Raises
     ------
     ConfigError
-        The recording was begun with other cameras, frames or poses; or the operator cannot turn objects.
+        The recording was begun with other cameras, frames or poses; the operator cannot turn objects; no such view.
     DiskFull
         The disk is too small, or full.
     BusyError
@@ -83,7 +87,7 @@ def record(
     DeviceError
         Two views in a row failed three times each.
     Stopped
-        The observer ended the run.
+        The observer, or ``tofcapture stop``, ended the run.
     """
     if frames < 1:
         raise ConfigError(f"frames: expected at least 1, got {frames}")
@@ -94,7 +98,9 @@ def record(
             "turns: this station's operator cannot turn the object",
             hint='a person can: [operator] driver = "console", in a terminal; or record without --turns',
         )
-    with full_disk_named(recording):
+    if retake is not None and retake not in {view.index for view in plan.views}:
+        raise ConfigError(f"retake: expected a view from 0 to {len(plan.views) - 1}, got {retake}")
+    with full_disk_named(recording), stoppable(f"{scene} into {recording}", station.arm.stop) as stop:
         recording.mkdir(parents=True, exist_ok=True)
         if not (copy := recording / "station.toml").exists():
             write_text(copy, tomli_w.dumps(station.config))
@@ -106,8 +112,9 @@ def record(
             repaired = reconcile(journal, recording, scene)
             kept = journal.expect(scene, {view.index: view.digest for view in plan.views})
             observer.planned(plan, kept, repaired)
-            run = _Run(station, scene, recording, frames, plan, journal, observer)
-            missing = [view for view in plan.views if view.index not in kept]
+            run = _Run(station, scene, recording, frames, plan, journal, observer, stop)
+            again = kept if retake is None else {view.index for view in plan.views} - {retake}
+            missing = [view for view in plan.views if view.index not in again]
             for n, planned in enumerate(missing):
                 if progress:
                     progress(len(kept) + n - len(run.reasons), len(plan.views))
@@ -131,6 +138,7 @@ class _Run:
     plan: Plan
     journal: Journal
     observer: Observer
+    stop: Stop
     turned: float | None = None  # how the object stands; after an earlier run nobody knows
     failed_in_a_row: int = 0
     recorded: list[int] = field(default_factory=list)
@@ -157,6 +165,7 @@ class _Run:
                 tof, stereo, after = self.expose(planned)
                 numbers = self.check(tof, stereo, before, after)
             except DeviceError as err:
+                self.stop.check()
                 # A refused motion is refused for good.
                 if attempt == ATTEMPTS or isinstance(err, MotionRefused):
                     self.give_up(planned.index, err)
@@ -200,7 +209,11 @@ class _Run:
     def seal(self, view: View) -> None:
         """Write a view under its name, then note it in the journal."""
         self.begin(view.index, "sealing")
-        digest = write_view(view_path(self.recording, self.scene, view.index), view)
+        path = view_path(self.recording, self.scene, view.index)
+        if path.exists():
+            self.journal.forget(self.scene, view.index, "taken again")
+            keep_copy(path, "retaken")
+        digest = write_view(path, view)
         self.journal.seal(self.scene, view.index, digest)
         self.observer.sealed(view, digest)
         self.recorded.append(view.index)
@@ -210,7 +223,10 @@ class _Run:
         """Note that a view failed; raise when the one before it failed too."""
         # An arm that was told to stop refuses to move: the observer says so, that is no failure of the view.
         self.observer.step(index, "failed")
-        self.journal.fail(self.scene, index, error.message)
+        if view_path(self.recording, self.scene, index).exists():
+            self.journal.step(self.scene, index, "")  # it was to be taken again: the one before stays
+        else:
+            self.journal.fail(self.scene, index, error.message)
         self.observer.failed(index, error.message)
         self.reasons[index] = error.message
         self.failed_in_a_row += 1
@@ -218,7 +234,8 @@ class _Run:
             raise error
 
     def begin(self, index: int, step: str) -> None:
-        """Journal a step of a view, before anything is done."""
+        """Journal a step of a view, before anything is done; raise :class:`Stopped` when nothing shall be done."""
+        self.stop.check()
         self.journal.step(self.scene, index, step)
         self.observer.step(index, step)
 

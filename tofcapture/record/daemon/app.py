@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,6 +31,7 @@ PAGE_FILES = {
 }
 
 _STREAM = "/v1/events"
+_LOG = timedelta(hours=12)
 
 Schema = dict[str, Any]
 _TOLD = json.loads(Path(__file__).with_name("api.json").read_text(encoding="utf-8"))
@@ -55,6 +57,9 @@ def check(schema: Mapping[str, Any], value: Any, where: str = "body") -> None:
             raise UsageError(f"{where}: {missing[0]} is missing")
         for key, found in value.items():
             check(known[key], found, f"{where}.{key}")
+    elif schema["type"] == "boolean":
+        if not isinstance(value, bool):
+            raise UsageError(f"{where}: expected true or false, got {str(value)[:40]}")
     elif schema["type"] == "string":
         # fullmatch: in Python "$" also matches ahead of a newline.
         if not isinstance(value, str) or not re.fullmatch(schema["pattern"].strip("^$"), value):
@@ -171,8 +176,9 @@ class Api:
 
     @route("GET", "/v1/jobs", "Jobs")
     def jobs(self) -> Schema:
-        """The newest 100 jobs, newest first."""
-        return {"jobs": [asdict(job) for job in self._do.store.newest()]}
+        """The running job, all that wait, in their order, then the 100 that ended last."""
+        store = self._do.store
+        return {"jobs": [asdict(job) for job in (*store.ahead(), *store.ended())]}
 
     @route("POST", "/v1/jobs", "Job", 201, 409, body="JobRequest")
     def add(self, **request: Any) -> web.Response:
@@ -190,16 +196,26 @@ class Api:
         """Take it out of the queue; a running one is stopped."""
         return asdict(self._do.cancel(_job_number(number)))
 
+    @route("POST", "/v1/jobs/{number}/retry", "Job", 409, body="Consent")
+    def retry(self, number: str, clear: bool) -> Schema:
+        """Queue once more what an ended job asked for; the new job."""
+        return asdict(self._do.retry(_job_number(number), clear))
+
+    @route("POST", "/v1/jobs/{number}/move", "Job", 409, body="Place")
+    def move(self, number: str, place: int) -> Schema:
+        """Give a waiting job another place."""
+        return asdict(self._do.reorder(_job_number(number), place))
+
     @route("POST", "/v1/pause", "State", body="Nothing")
     def pause(self) -> Schema:
         """Rest after the view in hand."""
         self._do.pause()
         return self.state()
 
-    @route("POST", "/v1/resume", "State", body="Nothing")
-    def resume(self) -> Schema:
+    @route("POST", "/v1/resume", "State", body="Consent")
+    def resume(self, clear: bool) -> Schema:
         """Go on."""
-        self._do.resume()
+        self._do.resume(clear)
         return self.state()
 
     @route("POST", "/v1/stop", "State", body="Nothing")
@@ -208,15 +224,25 @@ class Api:
         self._do.stop()
         return self.state()
 
-    @route("POST", "/v1/confirm", "State", body="Nothing")
-    def confirm(self) -> Schema:
+    @route("POST", "/v1/confirm", "State", body="Consent")
+    def confirm(self, clear: bool) -> Schema:
         """Say that the scene that was asked for is placed."""
-        self._do.confirm()
+        self._do.confirm(clear)
         return self.state()
 
     @route("GET", _STREAM, "text/event-stream", 400, 503)
     def events(self) -> None:
         """Tell what happens, as server-sent events, without end."""
+
+    @route("GET", "/v1/log", "Log")
+    def log(self) -> Schema:
+        """What happened in the last twelve hours but single steps, oldest first, the newest 500 at most."""
+        since = (datetime.now(UTC) - _LOG).isoformat(timespec="seconds")
+        return {
+            "events": [
+                {**e.data, "id": e.id, "utc": e.utc, "event": e.kind} for e in self._do.store.log(since)
+            ]
+        }
 
     @route("GET", "/v1/preview/{name}", "image/png")
     def preview(self, name: str) -> web.Response:

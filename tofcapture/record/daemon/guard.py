@@ -23,6 +23,7 @@ from tofcapture.errors import BusyError, DataError, TofError
 
 BODY_LIMIT = 64 * 1024  # bytes
 MOST_CONNECTIONS = 1024
+MOST_STRANGERS = 256  # connections of each listener that have not shown yet that they may ask
 IDLE = 30.0  # s that a connection may take to send a request, or to take an answer
 _BODY = 5.0  # s for a body
 
@@ -57,18 +58,39 @@ class Guard:
         self._hosts: frozenset[str] = frozenset()
         self._busy: set[RequestHandler] = set()
         self._waiting: dict[RequestHandler, float] = {}  # since when
+        self._strangers: list[dict[RequestHandler, None]] = []  # of each listener, the oldest first
         self.codes: dict[int, int] = {}
 
     def serve_tcp(self, port: int) -> None:
         """Set which names of this machine are ours."""
         self._hosts = frozenset(f"{name}:{port}" for name in ("127.0.0.1", "localhost", "[::1]"))
 
+    def door(self, server: web.Server) -> Callable[[], RequestHandler]:
+        """Let one listener's connections in. Of strangers the oldest goes when there are too many: there is always room."""
+        strangers: dict[RequestHandler, None] = {}
+        self._strangers.append(strangers)
+
+        def enter() -> RequestHandler:
+            if len(strangers) >= MOST_STRANGERS:
+                oldest = next(iter(strangers))
+                del strangers[oldest]
+                if oldest.transport is not None:
+                    oldest.transport.abort()
+            strangers[stranger := server()] = None
+            return stranger
+
+        return enter
+
     @web.middleware
     async def middleware(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse, or let handle; every error becomes JSON."""
         self._busy.add(request.protocol)
         try:
-            response = self._refuse(request) or await _handle(request, handler)
+            response = self._refuse(request)
+            if response is None:
+                for strangers in self._strangers:
+                    strangers.pop(request.protocol, None)
+                response = await _handle(request, handler)
         finally:
             self._busy.discard(request.protocol)
             self._waiting[request.protocol] = time.monotonic()

@@ -7,11 +7,13 @@ import getpass
 import ipaddress
 import logging
 import os
+import resource
 import signal
 import socket
 import sys
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 from aiohttp import web
@@ -23,8 +25,10 @@ from tofcapture.record.daemon.guard import Guard
 from tofcapture.record.daemon.settings import Settings, StateFolder, only_one, token_of
 from tofcapture.record.daemon.store import Store, Streams
 from tofcapture.record.daemon.supervisor import Supervisor
+from tofcapture.record.stopping import stoppable
 
 _BACKLOG = 512
+_DESCRIPTORS = 4096  # of this process, where the system allows them: more than the guard lets in
 _UNIT = Path(__file__).with_name("tofcapture.service")
 
 Address = tuple[str, int]
@@ -77,19 +81,21 @@ async def _serve(
     end = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, end.set)
-    await _listen(runner, settings.state, http)
-    api.page_url = _page_url(runner, token, guard)
+    assert runner.server is not None
+    listening = await _listen(runner.server, guard, settings.state, http)
+    api.page_url = _page_url(listening, token, guard)
     work = asyncio.create_task(supervisor.run())
     work.add_done_callback(lambda _: end.set())
-    helpers = [asyncio.create_task(_show_life(supervisor))]
-    if runner.server is not None:
-        helpers.append(asyncio.create_task(guard.hang_up(runner.server)))
-    announce(api.page_url)
-    notify("READY=1")
-    await end.wait()
+    helpers = [asyncio.create_task(t) for t in (_show_life(supervisor), guard.hang_up(runner.server))]
+    # Heard by a thread, whatever the loop does; the recorder hears it by itself.
+    stop = partial(asyncio.get_running_loop().call_soon_threadsafe, supervisor.stop)
+    with stoppable(f"the daemon over {settings.root}, which rests", stop):
+        announce(api.page_url)
+        notify("READY=1")
+        await end.wait()
     notify("STOPPING=1")
-    for site in list(runner.sites):
-        await site.stop()
+    for server in listening:
+        server.close()
     for helper in helpers:
         helper.cancel()
     await supervisor.close()
@@ -98,27 +104,32 @@ async def _serve(
     await work
 
 
-async def _listen(runner: web.AppRunner, state: StateFolder, http: Address | None) -> None:
-    """Listen on the Unix socket, and on TCP when wanted."""
-    await web.UnixSite(runner, str(state.socket), backlog=_BACKLOG).start()
+async def _listen(
+    server: web.Server, guard: Guard, state: StateFolder, http: Address | None
+) -> list[asyncio.Server]:
+    """Listen on the Unix socket, and on TCP when wanted. What connects to one takes no room of the other."""
+    loop, most = asyncio.get_running_loop(), resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    room = _DESCRIPTORS if most == resource.RLIM_INFINITY else min(_DESCRIPTORS, most)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (room, most))
+    found = [await loop.create_unix_server(guard.door(server), str(state.socket), backlog=_BACKLOG)]
     state.socket.chmod(0o600)
     if http is not None:
         try:
-            await web.TCPSite(runner, *http, backlog=_BACKLOG).start()
+            found.append(await loop.create_server(guard.door(server), *http, backlog=_BACKLOG))
         except OSError as err:
             raise BusyError(
                 f"cannot listen on {http[0]}:{http[1]}: {err.strerror}", hint="take another port"
             ) from err
+    return found
 
 
-def _page_url(runner: web.AppRunner, token: str, guard: Guard) -> str | None:
+def _page_url(listening: list[asyncio.Server], token: str, guard: Guard) -> str | None:
     """Find the address of the page, if TCP is served at all; the guard hears the port."""
-    for address in runner.addresses:
-        if not isinstance(address, str):
-            host, port = address[:2]
-            guard.serve_tcp(port)
-            name = f"[{host}]" if ":" in host else host
-            return f"http://{name}:{port}/#token={token}"
+    for server in listening[1:]:
+        host, port = server.sockets[0].getsockname()[:2]
+        guard.serve_tcp(port)
+        name = f"[{host}]" if ":" in host else host
+        return f"http://{name}:{port}/#token={token}"
     return None
 
 

@@ -26,6 +26,7 @@ class StateFolder:
         self.database = root / "queue.sqlite"  # queue and events
         self.previews = root / "preview"  # latest pictures
         self.token = root / "token"  # the secret that a TCP client must show
+        self.lock = root / "lock"  # held by the running daemon, whose process it names
         self.socket_fits = len(os.fsencode(self.socket)) <= _SOCKET_LIMIT
 
 
@@ -92,7 +93,7 @@ def only_one(state: StateFolder) -> Iterator[None]:
 
     Raises :class:`BusyError`: a daemon is running.
     """
-    with hold_file(state.root / "lock", f"{state.root}: a daemon is running", "tofcapture status"):
+    with hold_file(state.lock, f"{state.root}: a daemon is running", "tofcapture status"):
         state.socket.unlink(missing_ok=True)
         try:
             yield

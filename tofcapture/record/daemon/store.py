@@ -26,7 +26,7 @@ MOST_WAITING = 1_000
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS jobs (
     id INTEGER PRIMARY KEY AUTOINCREMENT, request_id TEXT UNIQUE, recording TEXT NOT NULL, scene TEXT NOT NULL,
-    views INTEGER NOT NULL, frames INTEGER NOT NULL, seed INTEGER,
+    views INTEGER NOT NULL, frames INTEGER NOT NULL, seed INTEGER, retake INTEGER, place INTEGER,
     state TEXT NOT NULL CHECK (state IN ('queued', 'running', 'done', 'failed', 'stopped')),
     reason TEXT NOT NULL DEFAULT '', utc TEXT NOT NULL, changed_utc TEXT NOT NULL
 );
@@ -47,6 +47,7 @@ class Job:
     views: int
     frames: int
     seed: int | None
+    retake: int | None  # the only view to take, again
     state: str
     reason: str
     utc: str
@@ -54,6 +55,9 @@ class Job:
 
 
 _FIELDS = ", ".join(f.name for f in fields(Job))
+WISH = ("request_id", "recording", "scene", "views", "frames", "seed", "retake")  # what is asked for
+_AHEAD = "state IN ('queued', 'running')"
+_LOG_LINES = 500
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,9 @@ class Store:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._db = open_database(path, _SCHEMA, "a daemon's queue", "move it away; recordings do not need it")
+        there = {row[1] for row in self._do("PRAGMA table_info(jobs)")}
+        for column in {"retake", "place"} - there:  # a queue of an earlier version
+            self._do(f"ALTER TABLE jobs ADD COLUMN {column} INTEGER")
 
     def close(self) -> None:
         """Close the database."""
@@ -105,10 +112,10 @@ class Store:
         if (waiting := self.counts().get("queued", 0)) >= MOST_WAITING:
             raise BusyError(f"{waiting} jobs are waiting already", hint="let some of them finish")
         now = utc_now()
-        values = [request.get(k) for k in ("request_id", "recording", "scene", "views", "frames", "seed")]
+        values = [request.get(key) for key in WISH]
         made = self._do(
-            "INSERT INTO jobs (request_id, recording, scene, views, frames, seed, state, utc, changed_utc)"
-            " VALUES (?, ?, ?, ?, ?, ?, 'queued', ?, ?)",
+            f"INSERT INTO jobs (request_id, {', '.join(WISH[1:])}, state, utc, changed_utc)"  # noqa: S608
+            " VALUES (?, ?, ?, ?, ?, ?, ?, 'queued', ?, ?)",
             [*values, now, now],
         ).lastrowid
         return self.job(int(made or 0)), True
@@ -123,14 +130,32 @@ class Store:
         rows = self._do(f"SELECT {_FIELDS} FROM jobs {where}", values)  # noqa: S608
         return [Job(*row) for row in rows]
 
-    def newest(self) -> list[Job]:
-        """List the newest 100 jobs, newest first."""
-        return self._jobs("ORDER BY id DESC LIMIT 100")
+    def ended(self) -> list[Job]:
+        """List the 100 jobs that ended last, the last one first."""
+        return self._jobs(f"WHERE NOT {_AHEAD} ORDER BY changed_utc DESC, id DESC LIMIT 100")
+
+    def ahead(self) -> list[Job]:
+        """List the running job, then all that wait, in the order in which they will run."""
+        return self._jobs(f"WHERE {_AHEAD} ORDER BY state = 'queued', coalesce(place, id), id")
 
     def next(self) -> Job | None:
-        """Find the job to work on: the running one, else the one that waits longest."""
-        order = "WHERE state IN ('queued', 'running') ORDER BY state = 'queued', id LIMIT 1"
-        return next(iter(self._jobs(order)), None)
+        """Find the job to work on: the running one, else the first that waits."""
+        return next(iter(self.ahead()), None)
+
+    def reorder(self, number: int, place: int) -> None:
+        """Give a waiting job another place among those that wait, 1 the next to run.
+
+        Raises :class:`DataError`: there is no such job; :class:`BusyError`: it does not wait any more.
+        """
+        ahead = [job.id for job in self.ahead() if job.state == "queued" or job.id == number]
+        if (job := self.job(number)).state != "queued":
+            raise BusyError(f"job {number} does not wait: it is {job.state}", hint="look at the queue again")
+        ahead.remove(number)
+        ahead.insert(place - 1, number)
+        # One statement, so that a crash leaves the old order or the new one. Numbers of later jobs are larger than any place; a
+        # running job that is put back has place 0, ahead of all.
+        cases = " ".join(f"WHEN {n} THEN {place}" for place, n in enumerate(ahead, start=1))
+        self._do(f"UPDATE jobs SET place = CASE id {cases} ELSE 0 END WHERE {_AHEAD}")  # noqa: S608
 
     def counts(self) -> dict[str, int]:
         """Count the jobs in each state."""
@@ -158,6 +183,14 @@ class Store:
         """List events of larger id, oldest first."""
         rows = self._do("SELECT id, utc, kind, data FROM events WHERE id > ? ORDER BY id", [after]).fetchall()
         return (Event(number, utc, kind, json.loads(data)) for number, utc, kind, data in rows)
+
+    def log(self, since: str) -> list[Event]:
+        """List what happened since a UTC string but single steps, oldest first, the newest 500 at most."""
+        rows = self._do(
+            "SELECT id, utc, kind, data FROM events WHERE utc >= ? AND kind != 'step' ORDER BY id DESC LIMIT ?",
+            [since, _LOG_LINES],
+        ).fetchall()
+        return [Event(number, utc, kind, json.loads(data)) for number, utc, kind, data in rows[::-1]]
 
     def last_event(self) -> int:
         """Find the id of the newest event, 0 when there is none."""

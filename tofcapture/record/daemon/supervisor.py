@@ -15,9 +15,10 @@ from dataclasses import asdict
 from typing import Any, Self
 
 from tofcapture import __version__
+from tofcapture.errors import BusyError, UsageError
 from tofcapture.files.view import check_scene_name
 from tofcapture.record.daemon.settings import Settings
-from tofcapture.record.daemon.store import Event, Job, Store
+from tofcapture.record.daemon.store import WISH, Event, Job, Store
 from tofcapture.record.journal import utc_now
 from tofcapture.record.resources import DiskFull
 
@@ -26,6 +27,7 @@ _SILENT = 3.0  # s without a sign of life until health says so
 _HEALTH = 2.0  # s between health events
 _BACKOFF = (0.2, 1.0, 3.0)  # s before a crashed recorder of a simulated arm is started again
 _LINE = 4 * 1024 * 1024  # bytes; a plan of thousands of views fits
+_STOPPED = "stopped by the operator"
 _ENDS = {"done", "stopped", "error"}  # kinds of a recorder's last message
 
 
@@ -96,7 +98,8 @@ class Progress:
         self.views: dict[int, dict[str, Any]] = {}
         self.doing: dict[str, Any] | None = None
         self.asks: str | None = None
-        self.simulated: bool | None = None
+        self.simulated: bool | None = None  # None until the station was open
+        self.scales: dict[str, Any] = {}  # of the latest pictures
         self.resting = False
         self.sealed_now = 0
         self._since, self._sealed_then = 0.0, 0  # when the recorder at work began, and what was sealed before
@@ -106,7 +109,7 @@ class Progress:
         if job != self.job:
             self.views = {}
         self.end()
-        self.job, self.sealed_now, self.simulated = job, 0, None
+        self.job, self.sealed_now = job, 0
 
     def end(self) -> None:
         """Do nothing any more."""
@@ -128,6 +131,7 @@ class Progress:
             view = self.views.setdefault(message["index"], {"index": message["index"]})
             view.update(told, state=kind)
             self.sealed_now += kind == "sealed"
+            self.scales = message.get("scales") or self.scales
             self.doing = None
         elif kind in {"ask", "answered"}:
             self.asks = str(message["scene"]) if kind == "ask" else None
@@ -163,20 +167,51 @@ class Supervisor:
         self._recorder: RecorderProcess | None = None
         self._wake = asyncio.Event()
         self._busy = self._stopping = self._closing = False
-        self.reason = ""
+        self.reason, self.fault = "", ""  # why it rests; the kind of error, where one is why
+        if settings.station is None:
+            self.progress.simulated = True
         if (job := store.next()) is not None:
             if job.state == "running":
                 store.move(job.id, "queued")
             self.reason = "the daemon was started with work waiting: look at the station, then resume"
 
+    @property
+    def real(self) -> bool:
+        """A real arm may move, so that a person must have looked first."""
+        return self.settings.allow_motion and not self.progress.simulated
+
+    def _check_clear(self, clear: bool) -> None:
+        """Raise :class:`UsageError`: a real arm may move, and nobody says that its reach is clear."""
+        if self.real and not clear:
+            raise UsageError(
+                "a real arm may move: expected clear: true",
+                hint="see that everybody is out of the arm's reach, then say so",
+            )
+
     def add(self, request: Mapping[str, Any]) -> tuple[Job, bool]:
         """Queue a job; see :meth:`Store.add`."""
+        self._check_clear(request["clear"])
         check_scene_name(request["scene"])
-        job, new = self.store.add(request)
+        job, new = self.store.add({key: request[key] for key in WISH if key in request})
         if new:
             self._say("queued", job=asdict(job))
             self._wake.set()
         return job, new
+
+    def retry(self, number: int, clear: bool) -> Job:
+        """Queue what an ended job asked for once more. Raises :class:`BusyError`: it has not ended."""
+        job = self.store.job(number)
+        if job.state in {"queued", "running"}:
+            raise BusyError(f"job {number} has not ended: it is {job.state}")
+        wish = {key: value for key, value in asdict(job).items() if key in WISH and key != "request_id"}
+        return self.add({**wish, "clear": clear})[0]
+
+    def reorder(self, number: int, place: int) -> Job:
+        """Give a waiting job another place; see :meth:`Store.reorder`."""
+        self.store.reorder(number, place)
+        job = self.store.job(number)
+        self._say("moved", job=asdict(job), place=place)
+        return job
 
     def pause(self) -> None:
         """Rest at the next safe point; no further job is begun."""
@@ -184,9 +219,10 @@ class Supervisor:
         self._order("pause")
         self._tell_state()
 
-    def resume(self) -> None:
+    def resume(self, clear: bool) -> None:
         """Go on."""
-        self.reason = ""
+        self._check_clear(clear)
+        self.reason = self.fault = ""
         if not self._stopping:
             self._order("resume")
         self._wake.set()
@@ -198,7 +234,7 @@ class Supervisor:
         self._order("stop")
         if self._recorder:
             asyncio.get_running_loop().call_later(GRACE, self._recorder.kill)
-        self.reason = "stopped by the operator"
+        self.reason, self.fault = _STOPPED, ""
         self._tell_state()
 
     def cancel(self, number: int) -> Job:
@@ -207,12 +243,13 @@ class Supervisor:
         if job.state == "running":
             self.stop()
         elif job.state == "queued":
-            job = self.store.move(number, "stopped", "cancelled")
+            job = self.store.move(number, "stopped", "removed by the operator")
             self._say("cancelled", job=asdict(job))
         return job
 
-    def confirm(self) -> None:
+    def confirm(self, clear: bool) -> None:
         """Pass on that the scene is placed."""
+        self._check_clear(clear)
         self._order("confirm")
 
     def _order(self, verb: str) -> None:
@@ -233,7 +270,7 @@ class Supervisor:
                     await self._work_on(job)
                 except DiskFull as err:
                     # Too full to note the job's end: it stays as it is, for when there is room.
-                    self.reason = f"{err.message}: {err.hint}"
+                    self.reason, self.fault = f"{err.message}: {err.hint}", type(err).__name__
                     self._rest()
             health.cancel()
 
@@ -260,6 +297,8 @@ class Supervisor:
         while True:
             before = self.progress.sealed_now
             last = await self._record(job)
+            if not last and job.retake is not None and self.progress.sealed_now:
+                last = {"kind": "done", "failed": [], "reasons": []}
             crashes = crashes + 1 if self.progress.sealed_now == before else 1
             # A real arm never moves again by itself after a crash.
             restarts = self.progress.simulated is not False and crashes <= len(_BACKOFF) and not self.reason
@@ -313,14 +352,17 @@ class Supervisor:
             self.store.move(job.id, state, "; ".join(last["reasons"]))
         elif self._closing:
             self.store.move(job.id, "queued")
-        elif self._stopping:
-            self.store.move(job.id, "stopped", "stopped by the operator")
+        elif self._stopping or kind == "stopped":
+            self.store.move(job.id, "stopped", _STOPPED)
+            self.reason = self.reason or _STOPPED
         elif kind == "error" and not last["lifted"]:
             self.store.move(job.id, "failed", last["message"])
         else:
             reason = " - ".join(filter(None, [last.get("message"), last.get("hint")]))
             self.store.move(job.id, "queued")
-            self.reason = self.reason or reason or "the recorder died: look at the station, then resume"
+            if not self.reason:
+                self.reason = reason or "the recorder died: look at the station, then resume"
+                self.fault = last.get("cause", "Died")
 
     @property
     def phase(self) -> str:
@@ -331,7 +373,9 @@ class Supervisor:
             return "paused" if self.reason else "idle"
         if self.progress.resting:
             return "paused"
-        return "pausing" if self.reason else "recording"
+        if self.reason:
+            return "pausing"
+        return "waiting" if self.progress.asks else "recording"
 
     def snapshot(self) -> dict[str, Any]:
         """Tell everything but the table of views, as JSON types."""
@@ -342,6 +386,8 @@ class Supervisor:
             "started_utc": self._started,
             "phase": self.phase,
             "reason": self.reason,
+            "fault": self.fault,
+            "real": self.real,
             "allow_motion": self.settings.allow_motion,
             "simulated": progress.simulated,
             "root": str(self.settings.root),
@@ -352,6 +398,7 @@ class Supervisor:
             "asks": progress.asks,
             "queue": store.counts(),
             "preview": self.counters["sealed"],
+            "scales": progress.scales,
             "last_event": store.last_event(),
             "health": self._health(),
         }

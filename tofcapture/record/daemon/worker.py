@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.colours import Kind, png_bytes, scale_for
+from tofcapture.colours import NO_VALUE, palette, png_bytes, scale_for
 from tofcapture.devices import Operator
 from tofcapture.errors import BusyError, DeviceError, TofError
 from tofcapture.files.seal import replacing
@@ -29,6 +29,7 @@ from tofcapture.ops.phase import Decoder
 from tofcapture.record.daemon.settings import PICTURES
 from tofcapture.record.observer import Observer, Stopped
 from tofcapture.record.resources import DiskFull, check_motion_allowed
+from tofcapture.record.stopping import stoppable
 
 if TYPE_CHECKING:
     from tofcapture.devices.station import Station
@@ -40,22 +41,29 @@ _PATIENCE = 1800.0  # s that an operator may take to place a scene
 _WIDE = 320  # px; larger pictures are thinned out
 
 
-def picture(kind: Kind, image: NDArray[Any]) -> bytes:
-    """Encode a map (H, W), NaN: none, as PNG of at most 320 pixels across."""
+def thinned(image: NDArray[Any]) -> NDArray[Any]:
+    """Take every n-th pixel of a map (H, W), at most 320 across."""
     step = -(-image.shape[1] // _WIDE)
-    small = image[::step, ::step]
-    scale = scale_for(kind, [small])
-    return png_bytes(scale.paint(small), level=1)
+    return image[::step, ::step]
 
 
-def save(view: View, folder: Path) -> None:
-    """Write the pictures of a view; a reader sees the old or the new one, never half of one."""
+def save(view: View, folder: Path) -> dict[str, Any]:
+    """Write the pictures of a view; a reader sees the old or the new one, never half of one.
+
+    Returns the scale of each: five ``ticks`` from low to high in its ``unit``, and nine ``colours``. Both depths share one.
+    """
     decoded = Decoder(view.tof.info).burst(view.tof.raw, float(np.mean(view.tof.celsius)))
-    images = (decoded.confidence, decoded.depth, view.stereo.points[..., 2])
-    kinds: tuple[Kind, ...] = ("amplitude", "depth", "depth")
-    for name, kind, image in zip(PICTURES, kinds, images, strict=True):
+    images = [thinned(m) for m in (decoded.confidence, decoded.depth, view.stereo.points[..., 2])]
+    amplitude, depth = scale_for("amplitude", images[:1]), scale_for("depth", images[1:])
+    scales = dict(zip(PICTURES, (amplitude, depth, depth), strict=True))
+    for (name, scale), image in zip(scales.items(), images, strict=True):
         with replacing(folder / f"{name}.png") as partial:
-            partial.write_bytes(picture(kind, image))
+            partial.write_bytes(png_bytes(scale.paint(image), level=1))
+    shown = np.linspace(0, NO_VALUE - 1, 9).astype(int)
+    return {
+        name: {"ticks": s.ticks, "unit": s.unit, "colours": palette(s.colours)[shown].tolist()}
+        for name, s in scales.items()
+    }
 
 
 def quality(view: View) -> dict[str, Any]:
@@ -92,7 +100,7 @@ class DaemonLink(Observer):
         """Follow orders until the line ends; then stop the arm and the process. Runs in a thread of its own."""
         for line in self._orders:
             self._follow(json.loads(line)["do"])
-        self._follow("stop")
+        self.stop()
         threading.Event().wait(_LAST_WORDS)
         os._exit(3)
 
@@ -104,6 +112,10 @@ class DaemonLink(Observer):
             self._changed.notify_all()
         if order == "stop" and (station := self.station) is not None:
             station.arm.stop()
+
+    def stop(self) -> None:
+        """Stop the arm and the run, now."""
+        self._follow("stop")
 
     def check(self) -> None:
         """Raise :class:`Stopped` when the recorder shall end."""
@@ -163,12 +175,13 @@ class DaemonLink(Observer):
     def sealed(self, view: View, sha256: str) -> None:
         """Tell what a view is like; pictures that cannot be made are no reason to lose a recording."""
         found: dict[str, Any] = {}
+        scales: dict[str, Any] = {}
         try:
-            save(view, self._previews)
+            scales = save(view, self._previews)
             found = quality(view)
         except (OSError, TofError, ValueError) as err:
             self.tell("log", text=f"no preview of view {view.index}: {err}")
-        self.tell("sealed", index=view.index, sha256=sha256, quality=found)
+        self.tell("sealed", index=view.index, sha256=sha256, quality=found, scales=scales)
 
     def failed(self, index: int, reason: str) -> None:
         """Tell why a view was given up."""
@@ -199,7 +212,8 @@ def _work(job: Mapping[str, Any], link: DaemonLink) -> dict[str, Any]:
         check_motion_allowed(station, job["allow_motion"], hint)
         link.tell("opened", station=station.describe(), simulated=station.simulated)
         staffed = replace(station, operator=PageOperator(link)) if station.operator.person else station
-        result = record(staffed, job["scene"], job["recording"], job["views"], job["frames"], observer=link)
+        wish = {key: job[key] for key in ("scene", "recording", "views", "frames", "retake")}
+        result = record(staffed, observer=link, **wish)
     return {"failed": list(result.failed), "reasons": list(result.reasons)}
 
 
@@ -208,6 +222,7 @@ def _error(err: BaseException) -> dict[str, Any]:
     return {
         "message": err.message if isinstance(err, TofError) else f"{type(err).__name__}: {err}",
         "hint": getattr(err, "hint", ""),
+        "cause": type(err).__name__,
         "lifted": isinstance(err, (DeviceError, BusyError, DiskFull)),
     }
 
@@ -223,7 +238,8 @@ def main() -> None:
     for task in (link.listen, link.show_life):
         threading.Thread(target=task, daemon=True).start()
     try:
-        link.tell("done", **_work(job, link))
+        with stoppable(f"{job['scene']} into {job['recording']}", link.stop):
+            link.tell("done", **_work(job, link))
     except Stopped:
         link.tell("stopped")
     except Exception as err:
