@@ -32,7 +32,7 @@ _KILLED = 2.0  # s until a killed process is gone
 _ROOT = 0
 _CREDENTIALS = struct.Struct("3i")  # process, user, group; the kernel fills it in
 
-Action = Callable[[], None]
+Action = Callable[[], object]
 
 
 class Stop:

@@ -86,7 +86,7 @@ class Guard:
         """Refuse, or let handle; every error becomes JSON."""
         self._busy.add(request.protocol)
         try:
-            response = self._refuse(request)
+            response: web.StreamResponse | None = self._refuse(request)
             if response is None:
                 for strangers in self._strangers:
                     strangers.pop(request.protocol, None)
