@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.hand_eye.checks import Cause, HandEyeRefused
-from calibration.hand_eye.closed_form import invert_all, park_martin, residuals, shah
+from calibration.hand_eye.closed_form import invert_all, park_martin, residuals, rotation_bound, shah
 from calibration.hand_eye.files import read_pairs, read_poses
 from calibration.hand_eye.pairs import make_stream, stream_pairs
 from calibration.hand_eye.refine import jacobian, refined_from_consensus
@@ -167,7 +167,6 @@ MISTAKES = {
     "target in mm": (lambda A, B: (A, scaled(B, 1000)), Cause.WRONG_UNITS),
     "hand in mm": (lambda A, B: (scaled(A, 1000), B), Cause.WRONG_UNITS),
     "target in inches": (lambda A, B: (A, scaled(B, 1 / 0.0254)), Cause.WRONG_UNITS),
-    "wrong square size": (lambda A, B: (A, scaled(B, 1.4)), Cause.TARGET_SCALE),
     "target mirrored": (lambda A, B: (A, S @ B @ S), Cause.MIRRORED),
     "hand mirrored": (lambda A, B: (S @ A @ S, B), Cause.MIRRORED),
     "y of the hand reversed": (lambda A, B: (scaled(A, np.array([1, -1, 1])), B), Cause.MIRRORED),
@@ -265,6 +264,93 @@ def test_time_offset_of_foreign_or_periodic_streams_is_refused():
         with pytest.raises(HandEyeRefused) as caught:
             stream_pairs(hand, second, offset)
         assert caught.value.cause == Cause.TIME_OFFSET
+
+
+@pytest.mark.parametrize(
+    ("factor", "eye_to_hand"), [(1.01, False), (1.03, True), (1.06, False), (1.2, True), (3.0, False)]
+)
+def test_a_wrong_target_size_is_solved_for_and_fails(factor, eye_to_hand):
+    """A target measured too large or too small gives the right X, within its error bar, and a verdict that nobody overlooks."""
+    A, B, X = station(7, 40, eye_to_hand=eye_to_hand)
+    for size in (factor, 1 / factor):
+        result = solve_hand_eye(A, scaled(B, size), eye_to_hand=eye_to_hand)
+        assert abs(result.scale[0] * size - 1) < 4 * result.scale[1]
+        assert apart(result.X, X)[1] < 3 * result.sigma[0]
+        assert result.verdict == ("FAIL" if factor > 1.015 else result.verdict)
+        assert result.verdict != "PASS"
+        assert any(Cause.TARGET_SCALE in text for text in result.failures + result.warnings)
+        accepted = solve_hand_eye(A, scaled(B, size), eye_to_hand=eye_to_hand, free_scale=True)
+        np.testing.assert_allclose(accepted.X, result.X, atol=1e-6)
+        assert not accepted.failures
+
+
+def test_a_right_target_size_is_believed():
+    """Of ten stations with the right size one at most is solved with another, and none fails; a given factor is obeyed."""
+    results = [solve_hand_eye(*station(seed, 25)[:2]) for seed in range(10)]
+    assert sum(r.scale_used != 1 for r in results) <= 1
+    assert not any(r.failures for r in results)
+    A, B, X = station(3, 25)
+    obeyed = solve_hand_eye(A, scaled(B, 1.05), target_scale=1.0)
+    assert obeyed.scale_used == 1
+    assert obeyed.verdict == "WARN"
+    assert apart(obeyed.X, X)[1] > 0.005
+    assert apart(solve_hand_eye(A, scaled(B, 1.05), target_scale=1 / 1.05).X, X)[1] < 0.002
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-5])
+def test_repeated_pairs_count_once(jitter):
+    """Every pair three times, in any order, gives the error bar of every pair once; six pairs five times are six pairs."""
+    A, B, X = station(5, 20)
+    rng = np.random.default_rng(0)
+    again = rng.permutation(np.repeat(np.arange(20), 3))
+    shaken = np.stack([T @ exp(rng.normal(0, jitter, 6)) for T in B[again]])
+    one, three = solve_hand_eye(A, B), solve_hand_eye(A[again], shaken)
+    assert three.repeats == 40
+    assert three.residual.shape == (60, 6)
+    np.testing.assert_allclose(three.sigma, one.sigma, rtol=0.02)
+    assert apart(three.X, one.X)[1] < 1e-4
+    six = solve_hand_eye(np.repeat(A[:6], 5, axis=0), np.repeat(B[:6], 5, axis=0))
+    assert apart(six.X, X)[1] < 3 * six.sigma[0]
+    assert any("24 pairs repeat" in text for text in six.warnings)
+    with pytest.raises(HandEyeRefused, match="got 2 and 8 that repeat them"):
+        solve_hand_eye(np.repeat(A[:2], 5, axis=0), np.repeat(B[:2], 5, axis=0))
+
+
+def test_the_optimum_is_certified():
+    """The certificate covers the truth, grows with the noise, and says nothing about rotations that are not the best."""
+    bounds = []
+    for noise in (1e-4, 1e-3, 5e-3):
+        A, B, X = station(9, 25, noise_rad=noise)
+        result = solve_hand_eye(A, B)
+        assert result.starts[0] == result.starts[1]
+        assert apart(result.X, X)[0] < result.certified
+        bounds.append(result.certified)
+    assert bounds == sorted(bounds)
+    assert bounds[-1] < np.radians(3)
+    off = rotation_bound(A, B, result.X @ exp([0, 0, 0, 0.5, 0, 0]), result.Z, np.ones(25))
+    assert off > np.radians(28)
+
+
+@pytest.mark.parametrize("kind", ["Gaussian", "heavy tails"])
+def test_error_bars_cover_the_truth(kind):
+    """One sigma of each axis covers 60 to 80 % of 30 stations of 25 pairs, whatever the tails; two sigma more than 90 %."""
+    ratios = []
+    for seed in range(30):
+        A, B, X = station(seed, 25, 0.0, 0.0)
+        rng = np.random.default_rng(seed)
+        tail = np.ones(25) if kind == "Gaussian" else np.sqrt(3 / rng.chisquare(3, 25))
+        steps = tail[:, None] * rng.normal(0, [4e-4, 4e-4, 1e-3, 1.5e-3, 1.5e-3, 1.5e-3], (25, 6))
+        B = np.stack(
+            [
+                transform(rotation_exp(s[3:]) @ b[:3, :3], b[:3, 3] + s[:3])
+                for s, b in zip(steps, B, strict=True)
+            ]
+        )
+        found = refined_from_consensus(A, B)
+        off = np.r_[found.X[:3, 3] - X[:3, 3], rotation_log(found.X[:3, :3] @ X[:3, :3].T)]
+        ratios.append(np.abs(off) / np.sqrt(np.diag(found.covariance)[:6]))
+    assert 0.6 < np.mean(np.array(ratios) < 1) < 0.8
+    assert np.mean(np.array(ratios) < 2) > 0.9
 
 
 def test_result_is_json(tmp_path):

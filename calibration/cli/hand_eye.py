@@ -45,6 +45,12 @@ def configure_hand_eye(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="of CSV streams: hand at t + S belongs to target at t (found when not given)",
     )
+    parser.add_argument(
+        "--target-scale",
+        metavar="free|FACTOR",
+        help="the target's distances times FACTOR are believed (1: as given), or whatever fits (free); else a size that the pairs "
+        "contradict by 3 sigma and 1 percent is solved for and fails",
+    )
     parser.add_argument("--out", type=Path, metavar="RESULT.json", help="write the result here")
 
 
@@ -53,9 +59,28 @@ def run_hand_eye(args: argparse.Namespace) -> Outcome:
     from calibration.hand_eye.solve import solve_hand_eye, to_dict
 
     hand, target, extra, blocks = _pairs(args)
-    result = solve_hand_eye(hand, target, eye_to_hand=args.eye_to_hand, blocks=blocks)
+    free = args.target_scale == "free"
+    result = solve_hand_eye(
+        hand,
+        target,
+        eye_to_hand=args.eye_to_hand,
+        blocks=blocks,
+        free_scale=free,
+        target_scale=None if free else _factor(args.target_scale),
+    )
     data = {**to_dict(result), **extra}
-    return kit.written(data, _hand_eye_table(result, data), args.out)
+    outcome = kit.written(data, _hand_eye_table(result, data), args.out)
+    return replace(outcome, exit_code=QualityError.exit_code if result.failures else 0)
+
+
+def _factor(text: str | None) -> float | None:
+    try:
+        factor = None if text is None else float(text)
+    except ValueError:
+        factor = -1.0
+    if factor is not None and not 0 < factor < np.inf:
+        raise UsageError(f"--target-scale: expected free or a factor above 0 such as 1, got {text!r}")
+    return factor
 
 
 def _pairs(args: argparse.Namespace) -> tuple[Float64, Float64, dict[str, Any], int | None]:
@@ -113,19 +138,28 @@ def _hand_eye_table(result: HandEye, data: dict[str, Any]) -> str:
         (label, f"{v['translation_mm']:.3f}", f"{v['rotation_deg']:.4f}") if v else (label, "-", "-")
         for label, v in values.items()
     ]
-    scale = data["target_scale"]
+    scale, best = data["target_scale"], data["optimum"]
     lines = [
         f"{name}  {data['mount']}, {data['pairs']} pairs, {len(data['outliers'])} outliers",
         f"  translation mm        {_numbers(t, 10, 2)}",
         f"  rotation vector deg   {_numbers(phi, 10, 3)}",
         kit.table(("", "translation mm", "rotation deg"), rows, "  "),
-        f"  target scale          {scale['factor']:.4f} +- {scale['standard_error']:.4f}",
+        f"  target scale          {scale['factor']:.4f} +- {scale['standard_error']:.4f}, solved with {scale['used']:.4f}",
+        (
+            f"  optimum               best of {best['starts']} starts, {best['ended_here']} ended there; no rotation farther than "
+            f"{best['certified_rotation_deg']:.2f} deg fits as well"
+        ),
         "  rotation of the hand  " + ", ".join(f"{a:.0f}" for a in data["motion_deg"]) + " deg RMS by axis",
     ]
     lines += [f"  {who} read as          {words}" for who, words in data.get("read_as", {}).items()]
     if "time_offset_s" in data:
         lines.append(f"  time offset           {1e3 * data['time_offset_s']:.1f} ms")
-    return "\n".join([*lines, *(f"  look: {text}" for text in data["warnings"])])
+    lines += [f"  FAIL: {text}" for text in data["failures"]]
+    if result.failures:
+        lines.append("        (--target-scale free uses the size that fits, --target-scale 1 the given one)")
+    return "\n".join(
+        [*lines, *(f"  look: {text}" for text in data["warnings"]), f"verdict: {data['verdict']}"]
+    )
 
 
 def _numbers(values: Any, width: int, digits: int) -> str:

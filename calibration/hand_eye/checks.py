@@ -88,7 +88,7 @@ def clean(T: ArrayLike, name: str) -> Float64:
     return out
 
 
-def check_numbers(A: Float64, B: Float64) -> None:
+def check_numbers(A: Float64, B: Float64, repeated: int = 0) -> None:
     """Refuse unequal numbers of poses (:class:`DataError`), too few of them and lengths that cannot be metres (by name)."""
     if len(A) != len(B):
         raise DataError(
@@ -97,6 +97,7 @@ def check_numbers(A: Float64, B: Float64) -> None:
         )
     if len(A) < MIN_PAIRS:
         got = f"expected at least {MIN_PAIRS}, better 15 to 30, got {len(A)}"
+        got += f" and {repeated} that repeat them" if repeated else ""
         raise HandEyeRefused(Cause.TOO_FEW, got, "record more views")
     for name, T in (("hand", A), ("target", B)):
         size = float(np.median(np.linalg.norm(T[:, :3, 3], axis=1)))

@@ -124,6 +124,20 @@ def residuals(P: Float64, B: Float64, X: Float64, Z: Float64) -> Float64:
     return np.concatenate([seen[..., :3, 3] - B[..., :3, 3], turned], axis=-1)
 
 
+def rotation_bound(P: Float64, B: Float64, X: Float64, Z: Float64, weight: Float64) -> float:
+    """Certify rotations as the best of all: no others farther from these than this angle (radians) fit the pairs as well.
+
+    The chordal fit ``sum_i w_i tr(R_Z^T R_P R_X R_B)`` is bilinear in X and Z, so the singular values of its matrix (9, 9) bound it
+    over everything, rotation or not: the relaxation behind :func:`shah`. A fit c between the two largest, s1 and s2, keeps an
+    overlap of (c - s2) / (s1 - s2) with the best pair. Pairs (N, 4, 4), weights (N,); pi where nothing is certified.
+    """
+    K = np.einsum("n,nac,ndb->abcd", weight, P[:, :3, :3], B[:, :3, :3]).reshape(9, 9)
+    s = np.linalg.svd(K, compute_uv=False)
+    fit = float(Z[:3, :3].ravel() @ K @ X[:3, :3].ravel()) / 3
+    lost = max(s[0] - fit, 0.0) / max(s[0] - s[1], 1e-12)
+    return float(2 * np.arcsin(min(1.0, np.sqrt(3 * lost))))
+
+
 def distances(residual: Float64) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lengths (metres, radians) of the two halves of residuals (..., 6)."""
     return np.linalg.norm(residual[..., :3], axis=-1), np.linalg.norm(residual[..., 3:], axis=-1)

@@ -15,7 +15,9 @@ BETTER = 3.0  # times less noise: another reading of the numbers is believed
 GOOD = 0.5  # score below which no mistake was made: the smallest motion let through leaves more when misread
 LIMIT = (0.030, np.radians(3.0))  # m, rad per axis: noise beyond which pairs are no calibration
 AGREE = 0.75  # share of the pairs that must agree
-WRONG_SIZE = 0.1  # relative; less than that is a warning
+UNSIZED = 5.0  # factor; farther off it is a mistake of units
+SIZINGS = 3
+SMALLER = 0.9  # of the noise is left where another size of the target is believed
 FAIR = 5.0  # fair stations' noise; roles are judged only where the fit is better
 MOUNT = 0.5  # m; mounts on hands are shorter, ways to targets longer
 SECOND = 0.6  # share of the remainder that must agree on a second board
@@ -44,9 +46,7 @@ def check_agreement(A: Float64, B: Float64, found: Consensus, *, eye_to_hand: bo
     P = oriented(A, eye_to_hand=eye_to_hand)
     few = thinned(len(A), SHOWN)
     if found.score > GOOD:
-        given = consensus(P[few], B[few])
-        _check_mistakes(A[few], B[few], given, eye_to_hand=eye_to_hand)
-        _check_scale(P[few], B[few], given)
+        _check_mistakes(A[few], B[few], consensus(P[few], B[few]), eye_to_hand=eye_to_hand)
     _check_roles(A, B, found, eye_to_hand=eye_to_hand)
     noisy = found.noise[0] > LIMIT[0] or found.noise[1] > LIMIT[1]
     if not noisy and found.inliers.mean() >= AGREE:
@@ -61,20 +61,32 @@ def check_agreement(A: Float64, B: Float64, found: Consensus, *, eye_to_hand: bo
     )
 
 
-def target_scale(P: Float64, B: Float64, rotation: Float64) -> tuple[float, float]:
-    """Find the factor by which the target's distances must be multiplied to fit the arm's, and its standard deviation.
+def scaled_consensus(P: Float64, B: Float64) -> tuple[Consensus, float]:
+    """Find the consensus of pairs (N, 4, 4), and the factor of the target's distances that it needs.
 
-    Linear least squares in (t_X, t_Z, s) of ``R_P t_X - t_Z + s R_P R_X t_B = -t_P``.
+    The factor is one unless another, no farther than ``UNSIZED``, leaves clearly less noise: it is a start, and a diagnosis of other
+    mistakes is not to take it for noise.
     """
+    found, scale = consensus(P, B), 1.0
+    for _ in range(SIZINGS):
+        kept = found.inliers
+        factor = scale * _linear_scale(P[kept], scaled(B[kept], scale), found.X[:3, :3])
+        if not 1 / UNSIZED < factor < UNSIZED:
+            break
+        other = consensus(P, scaled(B, factor))
+        if other.penalty > SMALLER * found.penalty:
+            break
+        found, scale = other, factor
+    return found, scale
+
+
+def _linear_scale(P: Float64, B: Float64, rotation: Float64) -> float:
+    """Find the factor of the target's distances by least squares in (t_X, t_Z, s) of ``R_P t_X - t_Z + s R_P R_X t_B = -t_P``."""
     n = len(P)
     left = np.zeros((n, 3, 7))
     left[:, :, :3], left[:, :, 3:6] = P[:, :3, :3], -np.eye(3)
     left[:, :, 6] = np.einsum("nij,jk,nk->ni", P[:, :3, :3], rotation, B[:, :3, 3])
-    M, right = left.reshape(-1, 7), -P[:, :3, 3].reshape(-1)
-    solution = np.linalg.lstsq(M, right, rcond=None)[0]
-    freedom = max(3 * n - 7, 1)
-    variance = float(np.square(M @ solution - right).sum()) / freedom * np.linalg.pinv(M.T @ M)[6, 6]
-    return float(solution[6]), float(np.sqrt(variance))
+    return float(np.linalg.lstsq(left.reshape(-1, 7), -P[:, :3, 3].reshape(-1), rcond=None)[0][6])
 
 
 def _in_words(found: Consensus) -> str:
@@ -102,12 +114,12 @@ def _mistakes(A: Float64, B: Float64, *, eye_to_hand: bool) -> Iterator[Mistake]
     yield Mistake(Cause.MIRRORED, f"the target poses fit once mirrored: {left_handed}", A, S @ B @ S)
     for name, sign in zip("xyz", 1 - 2 * np.eye(3), strict=True):
         hint = f"translations have the wrong sign along {name}"
-        yield Mistake(Cause.MIRRORED, f"the target {hint}", A, _scaled(B, sign))
-        yield Mistake(Cause.MIRRORED, f"the hand {hint}", _scaled(A, sign), B)
+        yield Mistake(Cause.MIRRORED, f"the target {hint}", A, scaled(B, sign))
+        yield Mistake(Cause.MIRRORED, f"the hand {hint}", scaled(A, sign), B)
     for name, metres in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
         hint = "the {} translations are in {} while the others are in metres"
-        yield Mistake(Cause.WRONG_UNITS, hint.format("target", name), A, _scaled(B, metres))
-        yield Mistake(Cause.WRONG_UNITS, hint.format("hand", name), _scaled(A, metres), B)
+        yield Mistake(Cause.WRONG_UNITS, hint.format("target", name), A, scaled(B, metres))
+        yield Mistake(Cause.WRONG_UNITS, hint.format("hand", name), scaled(A, metres), B)
     reordered = (_reordered, Cause.QUATERNION_ORDER, "were read as x, y, z, w and are w, x, y, z")
     transposed = (
         _transposed,
@@ -190,23 +202,11 @@ def _transposed(T: Float64) -> Float64:
     return out
 
 
-def _scaled(T: Float64, factor: float | Float64) -> Float64:
+def scaled(T: Float64, factor: float | Float64) -> Float64:
+    """Multiply the translations of poses (N, 4, 4), each axis by its own factor where there are three."""
     out = T.copy()
     out[:, :3, 3] *= factor
     return out
-
-
-def _check_scale(P: Float64, B: Float64, given: Consensus) -> None:
-    kept = given.inliers
-    scale, sigma = target_scale(P[kept], B[kept], given.X[:3, :3])
-    if abs(scale - 1) < max(WRONG_SIZE, 5 * sigma) or scale <= 0:
-        return
-    if consensus(P, _scaled(B, scale)).penalty < given.penalty / BETTER:
-        raise HandEyeRefused(
-            Cause.TARGET_SCALE,
-            f"the target's distances must be multiplied by {scale:.3f} (+- {sigma:.3f}) to fit the hand's",
-            "the target was given a wrong square or marker size, or units are mixed",
-        )
 
 
 def _check_second(P: Float64, B: Float64, found: Consensus) -> None:

@@ -19,6 +19,9 @@ FREEDOM = 8.0  # degrees of freedom of Student's t: efficient on Gaussian noise,
 PRIOR = 12.0  # pairs' worth of belief that the camera's scatter is isotropic in each half
 FLOOR = (1e-7, 1e-7)  # m, rad; keeps noise-free data solvable
 ITERATIONS = 60
+STOP = 1e-8  # m, rad
+LEAST_LEFT = 0.02  # of a direction that only one group determines: its own residual tells nothing there
+SMALL = 3  # pairs that determine a calibration
 SANDWICH = 12  # pairs from which on their own scatter is believed more than the model
 
 
@@ -30,9 +33,11 @@ class Refined:
     Z: Float64  #: (4, 4)
     residual: Float64  #: (N, 6) metres and radians, camera frame
     scatter: Float64  #: (N, 6, 6) covariance of each pair's noise
-    #: (12, 12) of (t_X, phi_X, t_Z, phi_Z): metres, radians, rotations in the left tangent space
+    #: (12, 12) of (t_X, phi_X, t_Z, phi_Z): metres, radians, rotations in the left tangent space.
+    #: (13, 13) with the logarithm of ``scale`` at the end where that was free
     covariance: Float64
     left_out: Float64  #: (N, 6) residual of each pair under the solution without it; NaN where the rest determines nothing
+    scale: float = 1.0  #: Factor by which the target's distances must be multiplied
 
     @property
     def noise(self) -> tuple[float, float]:
@@ -44,6 +49,11 @@ class Refined:
     def distance(self) -> Float64:
         """(N,) Mahalanobis distance of each pair."""
         return np.asarray(np.sqrt(_mahalanobis2(self.residual, _inverse(self.scatter))))
+
+    @property
+    def weight(self) -> Float64:
+        """(N,) votes of the pairs: about one, near zero for outliers."""
+        return _weights(self.residual, _inverse(self.scatter))
 
     @property
     def log_likelihood(self) -> float:
@@ -61,8 +71,9 @@ def refine(
     blocks: int | None = None,
     *,
     eye_to_hand: bool = False,
+    free_scale: bool = False,
 ) -> Refined:
-    """Refine X and Z from a start by Gauss-Newton inside expectation-maximisation.
+    """Refine X and Z, and with ``free_scale`` the target's size, by Gauss-Newton inside expectation-maximisation.
 
     P and B are (N, 4, 4) pairs, N >= 3; P is T_flange_base, not T_base_flange, where ``eye_to_hand``. X and Z are the start,
     (4, 4), ``noise`` is a first guess of the noise per axis, metres and radians. ``blocks`` are stretches of consecutive pairs that
@@ -70,20 +81,38 @@ def refine(
     """
     whole = np.repeat(np.square(np.maximum(noise, FLOOR)), 3)
     camera, arm = np.diag(whole / 2), whole / 2
+    scale = 1.0
+    r, J = _linearised(P, B, X, Z, scale, free=free_scale)
     for _ in range(ITERATIONS):
-        r, J = residuals(P, B, X, Z), jacobian(P, X, Z)
         lever = _lever(P, X, Z, eye_to_hand=eye_to_hand)
         information = _inverse(_total(camera, arm, lever))
         weight = _weights(r, information)
         step = _solve(J, r, weight, information)
-        X, Z = moved(X, step[:6]), moved(Z, step[6:])
-        camera, arm = _sources(residuals(P, B, X, Z), weight, camera, arm, lever, information)
-        if np.abs(step).max() < 1e-9:
+        X, Z, scale = moved(X, step[:6]), moved(Z, step[6:12]), scale * float(np.exp(step[12:].sum()))
+        r, J = _linearised(P, B, X, Z, scale, free=free_scale)
+        camera, arm = _sources(r, weight, camera, arm, lever, information)
+        if np.abs(step).max() < STOP:
             break
-    r, J = residuals(P, B, X, Z), jacobian(P, X, Z)
     scatter = _total(camera, arm, _lever(P, X, Z, eye_to_hand=eye_to_hand))
     weight = _weights(r, _inverse(scatter))
-    return Refined(X, Z, r, scatter, *_uncertainty(J, r, weight, scatter, blocks))
+    return Refined(X, Z, r, scatter, *_uncertainty(J, r, weight, scatter, blocks), scale)
+
+
+def _linearised(
+    P: Float64, B: Float64, X: Float64, Z: Float64, scale: float, *, free: bool
+) -> tuple[Float64, Float64]:
+    """Residuals (N, 6) and their derivative (N, 6, 12), or (N, 6, 13) with the logarithm of the scale.
+
+    The prediction is divided by the scale: noise is the camera's first of all, and a regressor with noise would shrink.
+    """
+    r, J = residuals(P, B, X, Z), jacobian(P, X, Z)
+    if not free:
+        return r, J
+    predicted = (r[:, :3] + B[:, :3, 3]) / scale
+    r[:, :3] = predicted - B[:, :3, 3]
+    J[:, :3] /= scale
+    by_scale = np.concatenate([-predicted, np.zeros_like(predicted)], axis=1)
+    return r, np.concatenate([J, by_scale[..., None]], axis=2)
 
 
 def _lever(P: Float64, X: Float64, Z: Float64, *, eye_to_hand: bool) -> Float64:
@@ -153,7 +182,7 @@ def _weights(r: Float64, information: Float64) -> Float64:
 def _solve(J: Float64, r: Float64, weight: Float64, information: Float64) -> Float64:
     L = np.swapaxes(np.linalg.cholesky(information), 1, 2)
     root = np.sqrt(weight)[:, None]
-    left = (root[:, :, None] * (L @ J)).reshape(-1, 12)
+    left = (root[:, :, None] * (L @ J)).reshape(-1, J.shape[2])
     right = (root * np.einsum("nij,nj->ni", L, r)).reshape(-1)
     return np.asarray(-np.linalg.lstsq(left, right, rcond=None)[0], dtype=np.float64)
 
@@ -163,24 +192,50 @@ def _uncertainty(
 ) -> tuple[Float64, Float64]:
     """Covariance and left-out residuals.
 
-    With a dozen pairs or more the covariance is the sandwich of the scores of pairs or blocks: it holds when the noise model
-    does not. A left-out solution is one Newton step away from the full one, since the problem is nearly linear there.
+    A left-out solution is one Newton step away from the full one, since the problem is nearly linear there. The covariance is the
+    scatter of the scores of pairs or blocks, each divided by the root of what it did not pull towards itself (CR2 of Bell and
+    McCaffrey, 2002): it holds when the noise model does not. Few scores are themselves noisy, so the model of independent pairs
+    counts as a dozen of them, and what is left is widened as Student's t is. Below a dozen pairs the model is believed.
     """
     pull = weight[:, None, None] * np.linalg.inv(scatter)
     each = np.einsum("nia,nij,njb->nab", J, pull, J)
     H, score = each.sum(axis=0), np.einsum("nia,nij,nj->na", J, pull, r)
-    inverse = np.linalg.pinv(H)
-    covariance = inverse
-    n = len(r)
-    if n >= SANDWICH:
-        groups = score if blocks is None else np.stack([b.sum(axis=0) for b in np.array_split(score, blocks)])
-        covariance = inverse @ (groups.T @ groups) @ inverse * len(groups) / (len(groups) - 2)
     left_out = np.full_like(r, np.nan)
-    for i in range(n):
+    for i in range(len(r)):
         rest = H - each[i]
         if np.linalg.cond(rest) < 1e14:
             left_out[i] = r[i] + J[i] @ np.linalg.solve(rest, score[i])
-    return covariance, left_out
+    inverse = np.linalg.pinv(H) / _curvature(weight)
+    groups = len(r) if blocks is None else blocks
+    wider = (groups - 2) / (groups - 4) if groups > 2 * SMALL else 2.0
+    if groups < SANDWICH:
+        return inverse * wider, left_out
+    scores, shares = (
+        np.stack([b.sum(axis=0) for b in np.array_split(values, groups)]) for values in (score, each)
+    )
+    freed = _freed(H, shares, scores)
+    sandwich = inverse @ (freed.T @ freed) @ inverse
+    if blocks is None:
+        sandwich = (groups * sandwich + SANDWICH * inverse) / (groups + SANDWICH)
+    return sandwich * wider, left_out
+
+
+def _curvature(weight: Float64) -> float:
+    """Share of the weighted normal equations that is curvature of the likelihood: an outlier's pull grows less than its distance."""
+    far = 1 - FREEDOM * weight / (FREEDOM + 6)  # distance^2 / (FREEDOM + distance^2)
+    return float(1 - (2 / 6) * (weight * far).sum() / weight.sum())
+
+
+def _freed(H: Float64, shares: Float64, scores: Float64) -> Float64:
+    """Scores (G, p) divided by the root of one minus the group's share of the normal equations (G, p, p)."""
+    value, vector = np.linalg.eigh(H)
+    value = np.maximum(value, 1e-12 * value.max())
+    root, back = vector * np.sqrt(value), (vector / np.sqrt(value)).T
+    share, axes = np.linalg.eigh(back @ shares @ back.T)
+    left = 1 / np.sqrt(np.clip(1 - share, LEAST_LEFT, 1))
+    turned = np.einsum("gij,gi->gj", axes, scores @ back.T) * left
+    out: Float64 = np.einsum("gij,gj->gi", axes, turned) @ root.T
+    return out
 
 
 def refined_from_consensus(P: Float64, B: Float64) -> Refined:
