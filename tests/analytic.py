@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.decoding import decode
 from tofcapture.camera import Camera
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardWriter, TofMaps
 from tofcapture.frames import StereoInfo, TofInfo
-from tofcapture.ops.phase import mean_phasors, taps
+from tofcapture.ops.phase import taps
+from tofcapture.ops.phase.reference import decode
 from tofcapture.poses import look_at
 from tofcapture.rig import SPEED_OF_LIGHT, Rig
 
@@ -115,9 +115,7 @@ def shoot(shapes, camera, index, seed, frames):
     depth = np.where(hit, depth, np.nan).astype(np.float32)
     normals = np.where(hit[..., None], normals, np.nan).astype(np.float32)
     info = TofInfo("", "", camera, np.zeros(3))
-    found = decode(
-        mean_phasors(raw, info.modulation_hz, info.phase_rad), info.modulation_hz, camera, np.zeros(3)
-    )
+    found = decode(raw.mean(axis=0), info)
     gt = {
         s: GroundTruth(depth[:: 3 - s, :: 3 - s], normals[:: 3 - s, :: 3 - s], mask[:: 3 - s, :: 3 - s])
         for s in (1, 2)

@@ -166,7 +166,7 @@ def test_wrong_tables():
     for table, match in (
         ({"phases": 4}, "unknown: phases"),
         ({"connection": "wifi"}, "csi"),
-        ({"phase_rad": [0.0]}, "one phase_rad"),
+        ({"phase_rad": [0.0]}, "expected a phase for each of 4 channels"),
     ):
         with pytest.raises(ConfigError, match=match):
             device(**table)

@@ -11,7 +11,6 @@ import pytest
 from calibration.range_error.fit import fit_ranges
 from calibration.range_error.views import seen_of, surface_at_pixels
 from tests.commands import calibrate
-from tests.decoding import decode
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.light import Light
@@ -20,6 +19,7 @@ from tofcapture.errors import DataError, QualityError, UsageError
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, View
 from tofcapture.ops import phase
+from tofcapture.ops.phase.reference import decode_phasors
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError, Rig, dumps_rig, image_places, load_rig, loads_rig
 
 CAMERA = Camera(120, 90, 95.3, 100.4, 58.4, 50.7)
@@ -139,12 +139,12 @@ def test_fitted_errors_correct_a_burst():
     rng = np.random.default_rng(0)
     fit = fit_ranges([made(i, rng) for i in range(VIEWS)], T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
     away = made(40, rng, sensor=replace(SENSOR, read_noise=0.0, shot_noise=False, quantise=False), away=0.83)
-    decoded = decode(away.phasor, INFO.modulation_hz, CAMERA, INFO.illuminator, fit.errors, 45.0)
+    decoded = decode_phasors(away.phasor, replace(INFO, range_errors=fit.errors), 45.0)
     planes, good = surface_at_pixels(away, T_TOF_STEREO)
     off = decoded.radial - CAMERA.ray_lengths / (planes * CAMERA.rays).sum(axis=-1)
     assert np.sqrt(np.mean(np.square(off[good]))) < 1e-3
     errors = tuple(replace(e, per_inverse_amplitude=0.1) for e in fit.errors)
-    slow = decode(away.phasor, INFO.modulation_hz, CAMERA, INFO.illuminator, errors, 45.0)
+    slow = decode_phasors(away.phasor, replace(INFO, range_errors=errors), 45.0)
     raw = phase.taps(away.phasor, 2 * np.abs(away.phasor), INFO.modulation_hz, INFO.phase_rad)
     fast = phase.Decoder(replace(INFO, range_errors=errors))(raw, 45.0)
     assert np.abs(fast.depth - CAMERA.radial_to_depth(slow.radial)).max() < 2e-5

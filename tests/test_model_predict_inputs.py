@@ -188,7 +188,7 @@ def test_the_mean_does_not_hide_taps_that_saturate_in_some_shots(weights, rig, t
     assert not measured[20:28, 40:50].any()
     assert measured.sum() == measured.size - 4 * 20
     assert found["filled"] > 0
-    mean, _ = taken(burst, None, 4095, np.zeros(4))
+    mean, _ = taken(burst, None, TofInfo("", "", SMALL, np.zeros(3)), np.zeros(4))
     others = np.ones(burst.shape[1:], bool)
     others[2, 10:14, 20:25] = False
     np.testing.assert_array_equal(mean[others], burst.mean(axis=0)[others])

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.decoding import correct_range, decode, range_to_radial
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
 from tofcapture.frames import PAPER_MODULATION_HZ as HZ
 from tofcapture.frames import PAPER_PHASE_RAD as PHASES
+from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import (
     ambiguity,
     frequencies,
@@ -20,13 +22,14 @@ from tofcapture.ops.phase import (
     radial_to_range,
     radius_px,
     taps,
-    unwrap,
     wrapped_range,
 )
+from tofcapture.ops.phase.reference import correct_range, decode, decode_phasors, range_to_radial
 from tofcapture.rig import RangeError
 
 CAMERA = Camera(12, 9, 10.0, 10.5, 5.7, 4.1)
 ILLUMINATOR = np.array([0.007, 0.0, 0.0])
+INFO = TofInfo("", "", CAMERA, ILLUMINATOR)
 
 
 def encode(radial, camera=CAMERA, illuminator=ILLUMINATOR, amplitude=500.0, offset=1000.0):
@@ -54,15 +57,12 @@ def test_unambiguous_ranges():
 @pytest.mark.parametrize(("distance", "k"), [(0.5, 0), (2.0, 1), (3.5, 2), (5.0, 3), (6.5, 4)])
 def test_unwrapping_counts(distance, k):
     """Distances 0.5 to 6.5 m are in wraps 0 to 4 of 100 MHz."""
-    low, high = distance % ambiguity(20e6), distance % ambiguity(100e6)
-    assert round((distance - high) / ambiguity(100e6)) == k
-    assert unwrap(np.array(low), np.array(high), ambiguity(100e6), ambiguity(20e6)) == pytest.approx(distance)
-
-
-def test_unwrap_refuses_a_broken_ratio():
-    """Frequencies that are no multiples of each other are refused."""
-    with pytest.raises(DataError, match="whole frequency ratio"):
-        unwrap(np.zeros(1), np.zeros(1), 1.0, 2.5)
+    found = decode(
+        encode(np.full(CAMERA.shape, distance), illuminator=np.zeros(3)),
+        replace(INFO, illuminator=np.zeros(3)),
+    )
+    wraps = (found.ranges[1] - distance % ambiguity(100e6)) / ambiguity(100e6)
+    np.testing.assert_allclose(wraps, k, atol=1e-9)
 
 
 def test_phase_noise_follows_its_formula():
@@ -76,16 +76,12 @@ def test_phase_noise_follows_its_formula():
 
 
 def test_wrap_failures_at_a_given_phase_noise():
-    """With 0.2 rad of noise on both frequencies 0.21 % of the unwraps fail (10^6 draws)."""
+    """With 0.2 rad of noise on both frequencies 0.21 % of the unwraps fail (240,000 draws)."""
     rng = np.random.default_rng(1)
-    n, d = 1_000_000, 3.5
-    low, high = (
-        np.mod(2 * np.pi * d / ambiguity(f) + 0.2 * rng.standard_normal(n), 2 * np.pi)
-        * ambiguity(f)
-        / (2 * np.pi)
-        for f in (20e6, 100e6)
-    )
-    wrong = np.abs(unwrap(low, high, ambiguity(100e6), ambiguity(20e6)) - d) > 0.75
+    camera, d = Camera(600, 400, 500.0, 500.0, 300.0, 200.0), 3.5
+    phase = [2 * np.pi * d / ambiguity(f) + 0.2 * rng.standard_normal(camera.shape) for f in (20e6, 100e6)]
+    info = replace(INFO, camera=camera, illuminator=np.zeros(3))
+    wrong = np.abs(decode_phasors(np.exp(1j * np.array(phase)), info).radial - d) > 0.75
     assert 100 * wrong.mean() == pytest.approx(0.21, abs=0.05)
 
 
@@ -96,7 +92,7 @@ def test_decode_inverts_encode(distance, seed):
     order = np.random.default_rng(seed).permutation(8)
     hz, phases = [HZ[i] for i in order], [PHASES[i] for i in order]
     radial = np.full(CAMERA.shape, distance)
-    found = decode(phasors(encode(radial)[order], hz, phases), hz, CAMERA, ILLUMINATOR)
+    found = decode(encode(radial)[order], replace(INFO, modulation_hz=tuple(hz), phase_rad=tuple(phases)))
     np.testing.assert_allclose(found.radial, radial, atol=1e-9)
     np.testing.assert_allclose(found.amplitude[-1], 500.0, rtol=1e-9)
 
@@ -106,7 +102,7 @@ def test_decode_survives_the_wrap_of_the_high_frequency():
     rng = np.random.default_rng(2)
     radial = np.full(CAMERA.shape, ambiguity(100e6))
     raw = encode(radial, illuminator=np.zeros(3)) + 5 * rng.standard_normal((8, *CAMERA.shape))
-    found = decode(phasors(raw, HZ, PHASES), HZ, CAMERA, np.zeros(3))
+    found = decode(raw, replace(INFO, illuminator=np.zeros(3)))
     assert np.abs(found.radial - radial).max() < 0.02
 
 
@@ -136,7 +132,7 @@ def test_range_errors_are_taken_off():
         R = ambiguity(e.modulation_hz)
         measured = true + e.at(2 * np.pi * true / R, radius_px(CAMERA), 50.0)
         phasor.append(100 * np.exp(2j * np.pi * measured / R))
-    found = decode(np.stack(phasor), HZ, CAMERA, ILLUMINATOR, errors, celsius=50.0)
+    found = decode_phasors(np.stack(phasor), replace(INFO, range_errors=tuple(errors)), 50.0)
     assert np.abs(found.radial - radial).max() < 1e-4
 
 
@@ -156,11 +152,10 @@ def test_bursts_are_averaged_as_phasors():
 
 def test_saturated_and_dark_pixels_are_nan():
     """A saturated pixel and one without amplitude have no distance."""
-    phasor = phasors(encode(np.full(CAMERA.shape, 1.0)), HZ, PHASES)
-    phasor[:, 0, 0] = 0
-    saturated = np.zeros(CAMERA.shape, dtype=bool)
-    saturated[1, 1] = True
-    found = decode(phasor, HZ, CAMERA, ILLUMINATOR, saturated=saturated)
+    raw = encode(np.full(CAMERA.shape, 1.0))
+    raw[:, 0, 0] = 500
+    raw[3, 1, 1] = 4095
+    found = decode(raw, INFO)
     assert np.isnan(found.radial[[0, 1], [0, 1]]).all()
     assert np.isfinite(found.radial).sum() == found.radial.size - 2
 

@@ -6,14 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.decoding import decode
 from tests.test_sim_light import wall
 from tofcapture.devices.sim.config import Render, load_world, read_constants
 from tofcapture.devices.sim.sensor import Sensor
 from tofcapture.devices.sim.stereo import StereoModel
 from tofcapture.devices.sim.world import SimWorld, simulate
 from tofcapture.errors import ConfigError, DeviceError
-from tofcapture.ops.phase import mean_phasors
+from tofcapture.ops.phase.reference import decode
 from tofcapture.poses import rotation_angle
 
 SMALL = {
@@ -154,8 +153,7 @@ def test_ideal_world_measures_the_truth(world_path):
     """An ideal view of a single convex surface decodes to the exact depth of the world file, millimetre meshes included."""
     view = simulate(world_path, ideal=True, frames=1)
     info = view.tof.info
-    z = mean_phasors(view.tof.raw, info.modulation_hz, info.phase_rad)
-    decoded = decode(z, info.modulation_hz, info.camera, info.illuminator)
+    decoded = decode(view.tof.raw.mean(axis=0), info)
     assert view.tof.raw.dtype == np.float64
     assert info.range_errors == ()
     np.testing.assert_allclose(info.camera.radial_to_depth(decoded.radial), 1.0, atol=2e-4)
@@ -167,8 +165,7 @@ def test_real_view_is_quantised_and_near_the_truth(world_path):
     """With all imperfections on, raw is uint16 and the factory-corrected depth is right to a few centimetres everywhere."""
     view = simulate(world_path, ideal=False, frames=3)
     info = view.tof.info
-    z = mean_phasors(view.tof.raw, info.modulation_hz, info.phase_rad)
-    decoded = decode(z, info.modulation_hz, info.camera, info.illuminator, info.range_errors, 45.0)
+    decoded = decode(view.tof.raw.mean(axis=0), info, 45.0)
     assert view.tof.raw.dtype == np.uint16
     error = info.camera.radial_to_depth(decoded.radial) - 1.0
     assert 0 < np.median(np.abs(error)) < 0.02

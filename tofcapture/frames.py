@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntFlag
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
+from tofcapture.channels import Reach, check_channels
 from tofcapture.errors import DataError
 from tofcapture.poses import Float64, check_transform
 from tofcapture.rig import RangeError, Rig
@@ -28,13 +30,15 @@ class TofFlag(IntFlag):
     FLYING = 2
     LOW_CONFIDENCE = 4
     AMBIGUOUS = 8
+    INCONSISTENT = 16
 
 
 TOF_FLAG_DOCS = {
-    TofFlag.SATURATED: "a tap of a frame reached saturation; there is no depth",
+    TofFlag.SATURATED: "a tap of a frame reached saturation, of either sign, or holds a flag beyond it; there is no depth",
     TofFlag.FLYING: "on both sides of it, in a row or a column, depth jumps by more than a surface at 80 degrees: a mixed pixel",
     TofFlag.LOW_CONFIDENCE: "shot and read noise make the depth uncertain by more than 20 mm (one standard deviation)",
-    TofFlag.AMBIGUOUS: "the two frequencies disagree by more than a quarter of the high one's wrap: its number may be wrong",
+    TofFlag.AMBIGUOUS: "other wraps fit almost as well, or the frequencies disagree as much as a surface out of reach makes them",
+    TofFlag.INCONSISTENT: "taps of a frequency fit no cosine by more than noise: a stuck or swapped tap, motion; seen with four phases",
 }
 
 
@@ -48,17 +52,36 @@ class TofInfo:
     illuminator: Float64  #: (3,) light source in the ToF frame, metres.
     modulation_hz: tuple[float, ...] = PAPER_MODULATION_HZ  #: (K,) frequency of each raw channel.
     phase_rad: tuple[float, ...] = PAPER_PHASE_RAD  #: (K,) ``C_k = B + A cos(phi + phase_rad[k])``.
-    exposure: float = 400e-6  #: Integration time of one phase image, seconds.
-    saturation: float = 4095.0  #: Raw value from which a tap is saturated.
+    exposure: float = 400e-6  #: Integration time of one phase image, seconds; NaN: unknown.
+    #: Raw value from which a tap is saturated, of either sign; flags that a sensor writes into values lie beyond it.
+    saturation: float = 4095.0
     #: The camera's factory calibration, one per frequency; empty when it has none.
     range_errors: tuple[RangeError, ...] = ()
+    offset: bool = (
+        True  #: Taps carry the offset ``B``; I and Q alone do not, and two phases are enough for them.
+    )
+    #: Least and largest range of a surface, metres; among these wraps are chosen. ``None``: all that the frequencies tell apart.
+    reach: Reach | None = None
+
+    def __post_init__(self) -> None:
+        where = self.model or "ToF camera"
+        check_channels(self.modulation_hz, self.phase_rad, offset=self.offset, reach=self.reach, where=where)
+        if not self.saturation > 0:
+            raise DataError(f"{where}: expected a saturation above 0, got {self.saturation:g}")
+
+    def saturated(self, raw: NDArray[Any]) -> NDArray[np.bool_]:
+        """Tell which taps, any shape, reached saturation, of either sign, or hold a flag beyond it."""
+        # Integers are compared with an integer: not one of them is converted.
+        limit = self.saturation if raw.dtype.kind == "f" else math.ceil(self.saturation)
+        out: NDArray[np.bool_] = raw >= limit
+        return out if raw.dtype.kind == "u" else out | (raw <= -limit)
 
 
 @dataclass(frozen=True)
 class TofBurst:
     """Raw phase images of one static burst."""
 
-    #: (frames, K, H, W): uint16 as the sensor gave it (float64 only from an ideal simulation).
+    #: (frames, K, H, W): uint16 or int16 as the sensor gave it (float64 only from an ideal simulation).
     raw: NDArray[Any]
     time_ns: NDArray[np.int64]  #: (frames,) int64, monotonic clock.
     celsius: Float64  #: (frames,) float64 sensor temperature, NaN when the sensor does not say.

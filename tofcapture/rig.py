@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import tomllib
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
+from tofcapture.channels import SPEED_OF_LIGHT, Reach, parse_reach
 from tofcapture.errors import ConfigError
 from tofcapture.poses import Float64, check_transform, invert
-
-SPEED_OF_LIGHT = 299_792_458.0  # m/s, exact
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,7 @@ class RangeError:
     """Systematic range error of one modulation frequency: what the sensor measures too long.
 
     ``error = offset + scale r + sum_m (a_m cos m phi + b_m sin m phi) + per_pixel_radius * px + sum_ij c_ij x^i y^j +
-    per_kelvin * (T - T_ref) + per_inverse_amplitude / A`` with r the range in metres, phi = 4 pi f r / c, px the pixel's distance
+    per_kelvin * (T - T_ref) + per_inverse_amplitude / A + table`` with r the range in metres, phi = 4 pi f r / c, px the pixel's distance
     to the principal point, x and y the pixel's place from -1 to 1 across the image, A the amplitude (docs: method 0.4).
     """
 
@@ -38,6 +41,8 @@ class RangeError:
     #: ``(i, j, c_ij)``: powers of x and y, and metres; what a pixel measures too long for its place.
     image: tuple[tuple[int, int, float], ...] = ()
     per_inverse_amplitude: float = 0.0  #: Metres times raw units: what dark surfaces are measured too far.
+    #: Metres that each pixel measures too long, (H, W), as :func:`packed_table` writes it; a camera's phase table (P0) is one.
+    table: str = ""
 
     def at(
         self, phase: NDArray[np.floating], radius_px: NDArray[np.floating] | float, celsius: float,
@@ -67,17 +72,27 @@ class RangeError:
 
     def pixels(self, camera: Camera) -> Float64:
         """Compute the part that depends on the pixel alone, offset included: (H, W) metres."""
+        if self.table and (found := unpacked_table(self.table).shape) != camera.shape:
+            raise ConfigError(
+                f"range error of {self.modulation_hz / 1e6:g} MHz: expected a table of {camera.shape} pixels, got {found}"
+            )
         fixed = self.offset + self.per_pixel_radius * radius_px(camera)
         out: Float64 = fixed + self._of_place(image_places(camera))
         return out
 
     def _of_place(self, place: NDArray[np.floating] | None) -> Float64 | float:
-        if not self.image:
+        if not (self.image or self.table):
             return 0.0
         if place is None:
             raise ConfigError("range error: terms over the image need the pixel's place", "see image_places")
         x, y = place[..., 0], place[..., 1]
-        return np.asarray(sum(c * x**i * y**j for i, j, c in self.image), dtype=np.float64)
+        smooth = np.asarray(sum(c * x**i * y**j for i, j, c in self.image), dtype=np.float64)
+        if not self.table:
+            return smooth
+        table = unpacked_table(self.table)
+        H, W = table.shape
+        rows, columns = (np.rint((s + 1) / 2 * (n - 1)).astype(np.intp) for s, n in ((y, H), (x, W)))
+        return smooth + table[rows, columns]
 
     def _of_amplitude(self, amplitude: NDArray[np.floating] | None) -> Float64 | float:
         if not self.per_inverse_amplitude:
@@ -86,6 +101,26 @@ class RangeError:
             raise ConfigError("range error: the term of dark surfaces needs amplitudes")
         A = np.asarray(amplitude, dtype=np.float64)
         return np.divide(self.per_inverse_amplitude, A, out=np.zeros_like(A), where=A > 0)
+
+
+def packed_table(table: NDArray[np.floating]) -> str:
+    """Write metres (H, W) as text for a rig: base64 of a zlib-compressed float32 ``.npy``."""
+    held = io.BytesIO()
+    np.save(held, np.asarray(table, dtype="<f4"), allow_pickle=False)
+    return base64.b64encode(zlib.compress(held.getvalue(), 6)).decode()
+
+
+@lru_cache(maxsize=8)
+def unpacked_table(text: str) -> Float64:
+    """Read what :func:`packed_table` wrote; :class:`ConfigError` for anything but finite metres (H, W)."""
+    try:
+        held = io.BytesIO(zlib.decompress(base64.b64decode(text, validate=True)))
+        table = np.load(held, allow_pickle=False).astype(np.float64)
+    except (ValueError, zlib.error, EOFError, OSError) as err:
+        raise ConfigError(f"range_error: table: expected base64 of a compressed .npy: {err}") from err
+    if table.ndim != 2 or not np.isfinite(table).all():
+        raise ConfigError(f"range_error: table: expected finite metres (H, W), got shape {table.shape}")
+    return table
 
 
 def radius_px(camera: Camera) -> Float64:
@@ -113,6 +148,9 @@ class Rig:
     #: (3,) position of the ToF camera's light source in the ToF frame, metres.
     illuminator: Float64 = field(default_factory=lambda: np.zeros(3))
     range_errors: tuple[RangeError, ...] = ()  #: One per modulation frequency; empty when nothing is known.
+    reach: Reach | None = (
+        None  #: Least and largest range of a surface of this station, metres; ``None``: not stated.
+    )
 
     def __post_init__(self) -> None:
         self.stereo.pinhole("rig.stereo (a point map's grid is rectified)")
@@ -165,8 +203,9 @@ def range_error_table(error: RangeError) -> dict[str, Any]:
     # Later terms are written where there are any: cameras without them keep the bytes of their files.
     if image := table.pop("image"):
         table["image"] = [list(c) for c in image]
-    if not error.per_inverse_amplitude:
-        del table["per_inverse_amplitude"]
+    for name in ("per_inverse_amplitude", "table"):
+        if not table[name]:
+            del table[name]
     return table
 
 
@@ -176,7 +215,11 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
         "format": "tofcapture-rig",
         "version": 1,
         "units": "m",
-        "tof": {**camera_table(rig.tof), "illuminator": [float(x) for x in rig.illuminator]},
+        "tof": {
+            **camera_table(rig.tof),
+            "illuminator": [float(x) for x in rig.illuminator],
+            **({"reach": [float(r) for r in rig.reach]} if rig.reach else {}),
+        },
         "stereo": camera_table(rig.stereo),
         "T_tof_stereo": rig.T_tof_stereo.tolist(),
         "T_flange_tof": rig.T_flange_tof.tolist(),
@@ -209,6 +252,7 @@ def loads_rig(text: str, where: str = "rig") -> Rig:
         T_flange_tof=check_transform(table["T_flange_tof"], f"{where}: T_flange_tof"),
         illuminator=np.asarray(table["tof"].get("illuminator", [0, 0, 0]), dtype=np.float64),
         range_errors=tuple(range_error_from(e) for e in errors),
+        reach=parse_reach(table["tof"].get("reach"), f"{where}: [tof]"),
     )
 
 

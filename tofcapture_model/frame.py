@@ -17,13 +17,16 @@ class Frame(NamedTuple):
     """One ToF frame per batch item, float32."""
 
     raw: Tensor  #: (B, K, H, W) raw channels in units of the sensor's saturation value
-    phasor: Tensor  #: (B, 4, H, W) I and Q of the low, then of the high frequency, in the same unit
+    #: (B, 4, H, W) I and Q of the lowest, then of the highest frequency, in the same unit; one frequency is there twice
+    phasor: Tensor
     depth: Tensor  #: (B, 1, H, W) decoded depth (z), m; holes carry their nearest measured neighbour
     valid: Tensor  #: (B, 1, H, W) 1 where depth was measured, 0 where it was filled
-    confidence: Tensor  #: (B, 1, H, W) amplitude of the high frequency in units of the saturation value
-    gap: Tensor  #: (B, 1, H, W) range of the low minus range of the high frequency, m: the multipath cue
+    confidence: Tensor  #: (B, 1, H, W) amplitude of the highest frequency in units of the saturation value
+    gap: (
+        Tensor  #: (B, 1, H, W) range of the lowest minus range of the highest frequency, m: the multipath cue
+    )
     cues: Tensor  #: (B, 4, H, W) depth errors that physics expects, m: geometry.multipath
-    modulation: Tensor  #: (B, 2) low and high modulation frequency, Hz
+    modulation: Tensor  #: (B, 2) lowest and highest modulation frequency, Hz
     intrinsics: Tensor  #: (B, 4 or 9) of the (H, W) grid, px; see geometry.maps
     demodulation: Tensor  #: (B, 4, K) weights that turn taps into phasor
 

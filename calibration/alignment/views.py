@@ -79,7 +79,6 @@ def joint_view_of(view: View) -> JointView:
     phasor, depth = tof_depth(view.tof)
     celsius = float(np.mean(view.tof.celsius))
     _, signals = phase.Decoder(info).signals(view.tof.raw.mean(axis=0, dtype=np.float64), celsius)
-    low, gap = (x.reshape(-1).astype(np.float64) for x in (signals.range_low, signals.gap))
     board = _pixels_of(surface_points(view.tof, depth), info.camera)
     pixels = board[::STRIDE]
     hz = phase.frequencies(info.modulation_hz)
@@ -95,7 +94,7 @@ def joint_view_of(view: View) -> JointView:
         modulation_hz=hz,
         rays=rays[pixels],
         radius_px=phase.radius_px(info.camera).reshape(-1)[pixels],
-        ranges=np.stack([low, low - gap])[:, pixels],
+        ranges=signals.ranges.reshape(len(hz), -1)[:, pixels].astype(np.float64),
         sigma=np.stack(sigma),
         halos=halo_errors(phasor, hz).reshape(len(hz), -1, len(HALO_RADII))[:, pixels],
         rims=_beside(lit_rims(phasor, depth, info.camera, info.illuminator), board, info.camera),

@@ -66,8 +66,10 @@ def seen_of(view: View, name: str) -> Seen:
     return Seen(
         name=name,
         info=burst.info,
-        phasor=phase.mean_phasors(burst.raw, burst.info.modulation_hz, burst.info.phase_rad),
-        saturated=np.asarray((burst.raw >= burst.info.saturation).any(axis=(0, 1))),
+        phasor=phase.mean_phasors(
+            burst.raw, burst.info.modulation_hz, burst.info.phase_rad, offset=burst.info.offset
+        ),
+        saturated=burst.info.saturated(burst.raw).any(axis=(0, 1)),
         sigma=range_sigma(burst),
         celsius=float(celsius.mean()) if len(celsius) else float("nan"),
         stereo=view.stereo.info.camera,

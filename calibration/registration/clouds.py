@@ -91,7 +91,7 @@ def range_sigma(burst: TofBurst) -> Float64:
     info, frames = burst.info, len(burst.raw)
     if frames < 2:
         return np.zeros(info.camera.shape)
-    z = phase.phasors(burst.raw, info.modulation_hz, info.phase_rad)[:, -1]
+    z = phase.phasors(burst.raw, info.modulation_hz, info.phase_rad, offset=info.offset)[:, -1]
     scatter = np.sqrt(np.median(z.var(axis=0, ddof=1) / 2) / frames)
     amplitude = np.maximum(np.abs(z.mean(axis=0)), 1e-9)
     out: Float64 = SPEED_OF_LIGHT / (4 * np.pi * max(info.modulation_hz)) * scatter / amplitude
@@ -104,7 +104,7 @@ def tof_depth(burst: TofBurst) -> tuple[NDArray[np.complex128], Float64]:
     The depth (H, W), metres, is NaN where a tap was saturated or nothing can be decoded.
     """
     info = burst.info
-    phasor = phase.mean_phasors(burst.raw, info.modulation_hz, info.phase_rad)
+    phasor = phase.mean_phasors(burst.raw, info.modulation_hz, info.phase_rad, offset=info.offset)
     depth = phase.Decoder(info).burst(burst.raw, float(np.mean(burst.celsius))).depth
     return phasor, depth.astype(np.float64)
 

@@ -134,9 +134,8 @@ def check_cameras(view: View, rig: Rig) -> None:
 
 def calibrated(info: TofInfo, rig: Rig) -> TofInfo:
     """Describe the ToF camera with the rig's constants instead of the maker's, where the rig has them."""
-    return replace(
-        info, camera=rig.tof, illuminator=rig.illuminator, range_errors=rig.range_errors or info.range_errors
-    )
+    errors, reach = rig.range_errors or info.range_errors, rig.reach or info.reach
+    return replace(info, camera=rig.tof, illuminator=rig.illuminator, range_errors=errors, reach=reach)
 
 
 def decoder_for(view: View, rig: Rig) -> Decoder:

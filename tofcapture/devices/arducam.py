@@ -39,6 +39,8 @@ _OPTIONAL = {
     "illuminator": [0.0, 0.0, 0.0],
     "saturation": 4095.0,
     "range_errors": [],
+    "offset": True,
+    "reach": None,
 }
 _REQUEST_MS = 2000
 _MISSES = 5  # frames in a row that may fail to come
@@ -52,7 +54,7 @@ class Arducam(ReopenedCamera, TofCamera):
     table
         ``connection`` ("csi" or "usb"), ``index`` (default 0), and the module's description, because the SDK says neither
         its modulation frequencies nor its phase steps: ``serial``, ``camera``, ``modulation_hz``, ``phase_rad``,
-        ``exposure``; optionally ``model``, ``illuminator``, ``saturation``, ``range_errors``.
+        ``exposure``; optionally ``model``, ``illuminator``, ``saturation``, ``range_errors``, ``offset``, ``reach``.
     context
         The station; not needed.
     """

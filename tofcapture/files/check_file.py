@@ -191,7 +191,7 @@ def _check_names(file: h5py.File, layout: Layout, path: Path) -> Iterator[Proble
 
 def _view_rules(file: h5py.File, info: TofInfo) -> Iterator[Finding]:
     yield from _increasing(file)
-    yield from _an_image(file, info.saturation)
+    yield from _an_image(file, info)
     yield from _point_map("/stereo/points", file["stereo/points"][()])
     yield from _rigid(file, "arm/before/T_base_flange", "arm/after/T_base_flange")
     if "truth" in file:
@@ -211,7 +211,7 @@ def _shard_rules(file: h5py.File, info: TofInfo) -> Iterator[Finding]:
         yield "/views/index", f"expected distinct numbers from 0 up, got {index.tolist()}"
     yield from _rigid(file, "views/T_base_tof")
     yield from _increasing(file)
-    yield from _an_image(file, info.saturation)
+    yield from _an_image(file, info)
     for view in range(len(index)):
         for name in ("tof/depth", "gt/native_depth"):
             yield from _depth(f"/{name}[{view}]", file[name][view], FARTHEST)
@@ -259,12 +259,12 @@ def _increasing(file: h5py.File) -> Iterator[Finding]:
         yield "/tof/time_ns", "expected times that increase within a burst, they do not"
 
 
-def _an_image(file: h5py.File, saturation: float) -> Iterator[Finding]:
+def _an_image(file: h5py.File, info: TofInfo) -> Iterator[Finding]:
     """Not every tap of a frame is saturated or zero: that is a covered or blinded sensor."""
     raw = file["tof/raw"]
     for index in np.ndindex(raw.shape[:-3]):
         frame = raw[index]
-        if (frame == 0).all() or (frame >= saturation).all():
+        if (frame == 0).all() or info.saturated(frame).all():
             yield f"/tof/raw{list(index)}", "expected an image, every tap is zero or saturated"
             return
 

@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.channels import parse_reach
 from tofcapture.errors import DataError, FormatError, TofError
 from tofcapture.files.layout import Field, Layout
 from tofcapture.frames import StereoInfo, TofInfo
@@ -151,9 +152,11 @@ def tof_table(info: TofInfo) -> dict[str, Any]:
         "illuminator": [float(x) for x in info.illuminator],
         "modulation_hz": [float(f) for f in info.modulation_hz],
         "phase_rad": [float(p) for p in info.phase_rad],
-        "exposure": float(info.exposure),
+        "exposure": float(info.exposure) if np.isfinite(info.exposure) else None,
         "saturation": float(info.saturation),
         "range_errors": [range_error_table(e) for e in info.range_errors],
+        "offset": bool(info.offset),
+        "reach": info.reach and [float(r) for r in info.reach],
     }
 
 
@@ -167,11 +170,17 @@ def tof_from(table: Mapping[str, Any], where: str) -> TofInfo:
             illuminator=np.asarray(table["illuminator"], dtype=np.float64),
             modulation_hz=tuple(float(f) for f in table["modulation_hz"]),
             phase_rad=tuple(float(p) for p in table["phase_rad"]),
-            exposure=float(table["exposure"]),
+            exposure=float("nan" if table["exposure"] is None else table["exposure"]),
             saturation=float(table["saturation"]),
             range_errors=tuple(range_error_from(e) for e in table["range_errors"]),
+            offset=bool(table.get("offset", True)),
+            reach=parse_reach(table.get("reach"), where),
         )
-    except (KeyError, TypeError, ValueError, TofError) as err:
+    except TofError as err:
+        raise FormatError(
+            f"{where}: tof_info does not describe a ToF camera: {err.message}", err.hint
+        ) from err
+    except (KeyError, TypeError, ValueError) as err:
         raise FormatError(f"{where}: tof_info does not describe a ToF camera: {err!r}") from err
 
 

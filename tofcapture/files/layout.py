@@ -124,7 +124,7 @@ def _layout(name: str, version: int, title: str, fields: str, attrs: str) -> Lay
 _DESCRIPTIONS = """\
 units       | text | always "m"; seconds, radians and hertz elsewhere
 rig         | TOML | the rig, see rig.toml below
-tof_info    | JSON | model, serial, intrinsics, illuminator, modulation_hz, phase_rad, exposure, saturation, range_errors
+tof_info    | JSON | model, serial, intrinsics, illuminator, modulation_hz, phase_rad, exposure, saturation, range_errors, offset, reach
 stereo_info | JSON | model, serial, intrinsics of the point map's grid
 provenance  | JSON | versions, digests of inputs, seeds, UTC time
 """
@@ -144,7 +144,7 @@ VIEW = _layout(
     1,
     "View file `RECORDING/views/<scene>/view-007.h5`",
     f"""
-tof/raw             | uint16 float64 | F K H W | 1 * * * | DN   | phase images of the static burst, as the sensor gave them
+tof/raw             | uint16 int16 float64 | F K H W | 1 * * * | DN   | phase images of the static burst, as the sensor gave them
 tof/time_ns         | int64          | F       | -       | ns   | monotonic clock
 tof/celsius         | float64        | F       | -       | degC | sensor temperature; NaN: not told
 stereo/points       | float32        | SH SW 3 | * * 1   | m    | organised point map, stereo frame; NaN: not measured
@@ -166,7 +166,7 @@ SHARD = _layout(
     1,
     "Shard `DATASET/shards/<scene>.h5`",
     f"""
-tof/raw           | uint16 float64 | N F K H W | 1 1 * * * | DN   | phase images, as the sensor gave them
+tof/raw           | uint16 int16 float64 | N F K H W | 1 1 * * * | DN   | phase images, as the sensor gave them
 tof/celsius       | float64        | N F       | -         | degC | sensor temperature; NaN: not told
 tof/time_ns       | int64          | N F       | -         | ns   | monotonic clock
 tof/depth         | float32        | N H W     | 1 * *     | m    | depth decoded from the burst's mean I and Q; NaN: none

@@ -95,7 +95,9 @@ def measure(
     ``frames`` ToF frames were asked for.
     """
     info = tof.info
-    amplitude = np.abs(mean_phasors(tof.raw, info.modulation_hz, info.phase_rad)).min(axis=0)
+    amplitude = np.abs(mean_phasors(tof.raw, info.modulation_hz, info.phase_rad, offset=info.offset)).min(
+        axis=0
+    )
     shift, turn = moved(before.T_base_flange, after.T_base_flange)
     dark = float((amplitude < DARK).mean())
     times = np.asarray(tof.time_ns, dtype=np.int64)
@@ -105,7 +107,7 @@ def measure(
         "missing_frames": float(max(frames - len(tof.raw), 0)),
         "stale_frames": float(_stale(tof, before.time_ns) + (stereo.time_ns < before.time_ns - _CLOCKS)),
         "frame_drops": float(_drops(times)),
-        "saturated": float((tof.raw >= info.saturation).any(axis=(0, 1)).mean()),
+        "saturated": float(info.saturated(tof.raw).any(axis=(0, 1)).mean()),
         "dark": dark,
         "unlit": dark,
         "stereo_coverage": float(np.isfinite(stereo.points[..., 2]).mean()),

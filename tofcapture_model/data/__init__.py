@@ -22,11 +22,11 @@ from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.shard import ShardReader
 from tofcapture.frames import TofInfo
-from tofcapture.ops.phase import Decoder, TapNoise, frequencies, photon_transfer
-from tofcapture.ops.phase.float32 import tap_weights
+from tofcapture.ops.phase import Decoder, TapNoise, photon_transfer
 from tofcapture_model.data.augment import BurstNoise
 from tofcapture_model.data.raw_input import taken
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, NO_MAPS, Frame, Target
+from tofcapture_model.geometry.decoder import demodulation, modulation
 from tofcapture_model.geometry.maps import (
     cut_intrinsics,
     expect_usable,
@@ -84,25 +84,25 @@ def make_frame(
     :func:`frame_decoder` of the same camera; ``None`` builds its tables anew, which takes as long as some frames.
     """
     maps, signals = (decoder or frame_decoder(info, camera)).signals(raw, celsius)
-    depth, hz = maps.depth, frequencies(info.modulation_hz)
+    depth, ends = maps.depth, signals.phasor[[0, -1]]
     valid = np.isfinite(depth) & (depth > MIN_RANGE) & (depth < MAX_RANGE)
     frame = Frame(
         raw=_tensor(raw) / info.saturation,
-        phasor=_tensor(signals.phasor.reshape(4, *depth.shape)) / info.saturation,
+        phasor=_tensor(ends.reshape(4, *depth.shape)) / info.saturation,
         depth=_tensor(fill_nearest(depth, valid)[None]),
         valid=_tensor(valid[None]),
         confidence=_tensor(maps.confidence[None]) / info.saturation,
         gap=_tensor(np.nan_to_num(signals.gap[None])),
         cues=torch.empty(0),
-        modulation=torch.tensor(hz, dtype=torch.float32),
+        modulation=modulation(info),
         intrinsics=intrinsics_of(camera),
-        demodulation=_tensor(tap_weights(info)[[0, 2, 1, 3]]),
+        demodulation=demodulation(info),
     )
-    return frame._replace(cues=with_cues(batched(frame), hz[1]).cues[0])
+    return frame._replace(cues=with_cues(batched(frame), max(info.modulation_hz)).cues[0])
 
 
 def with_cues(frame: Frame, hz: float) -> Frame:
-    """Add the cues to a batch of decoded frames, on its device; ``hz`` is the high frequency."""
+    """Add the cues to a batch of decoded frames, on its device; ``hz`` is the highest frequency."""
     return frame._replace(cues=cues(frame.phasor, frame.depth, frame.valid, frame.gap, frame.intrinsics, hz))
 
 
@@ -280,7 +280,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         shots = range(self.averaged) if self.mean else [sample.frame]
         celsius = np.array([reader.celsius(sample.view, f) for f in shots])
         burst = np.stack([reader.raw(sample.view, f) for f in shots])
-        raw, temperature = taken(burst, None if self.mean else 0, reader.info.saturation, celsius)
+        raw, temperature = taken(burst, None if self.mean else 0, reader.info, celsius)
         if sample.scene not in self._decoders:
             self._decoders[sample.scene] = frame_decoder(reader.info, reader.camera)
         frame = make_frame(raw, reader.info, reader.camera, temperature, self._decoders[sample.scene])

@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
+from tofcapture.channels import channels_in_words, frequencies, mismatch, wrap_table
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.frames import TofInfo
-from tofcapture.ops.phase import Decoder, ambiguity, frequencies
+from tofcapture.ops.phase import Decoder, information
+from tofcapture.ops.phase.float32 import tap_rows
 from tofcapture.rig import RangeError, load_rig
 
 Float32 = NDArray[np.float32]
@@ -34,7 +36,6 @@ NOMINAL_RANGE_ERRORS = (
 )
 """Range errors measured on that sensor; taken for an array without a rig if its two frequencies agree with them only."""
 
-CHANNELS = "20 MHz at 0, 90, 180, 270 deg, then 100 MHz at the same"
 SATURATION = 4095.0  # counts, of a 12-bit sensor: taken for an array unless it is said
 _ARRAYS = (".npy", ".npz")
 _KINDS = "a view file or a shard (.h5), or an array (.npy, .npz)"
@@ -68,7 +69,7 @@ def _which(raw: NDArray[Any], frame: int | None) -> str:
 
 
 def taken(
-    raw: NDArray[Any], frame: int | None, saturation: float, celsius: NDArray[np.float64]
+    raw: NDArray[Any], frame: int | None, info: TofInfo, celsius: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
     """Take one frame (K, H, W) of a burst (F, K, H, W), or with ``None`` the mean, and its sensor temperature of (F,).
 
@@ -80,7 +81,7 @@ def taken(
             raise ConfigError(f"expected a frame of 0 to {len(raw) - 1}, got {frame}")
         return raw[frame].astype(np.float64), float(celsius[frame])
     mean = raw.mean(axis=0, dtype=np.float64)
-    mean[raw.max(axis=0) >= saturation] = saturation
+    mean[info.saturated(raw).any(axis=0)] = info.saturation
     return mean, float(celsius.mean())
 
 
@@ -97,8 +98,8 @@ def read_input(
     Parameters
     ----------
     path
-        View file or shard (``.h5``), or an array (8, H, W) or (F, 8, H, W), ``.npy`` or ``.npz`` with one array or one called
-        ``raw``: counts in the order of :data:`CHANNELS`.
+        View file or shard (``.h5``), or an array (K, H, W) or (F, K, H, W), ``.npy`` or ``.npz`` with one array or one called
+        ``raw``: counts in the order of the paper's camera, or as ``modulation_hz`` and ``phase_rad`` beside it say.
     view
         Of a shard.
     rig, saturation
@@ -110,7 +111,7 @@ def read_input(
     Raises
     ------
     DataError
-        Missing, damaged, of a wrong shape, or an array that is no four-phase raw data of this order and unit.
+        Missing, damaged, of a wrong shape, or an array that is no raw data of these channels and this unit.
     ConfigError
         No such view or frame, or a rig or a saturation for a file that carries its own.
     """
@@ -129,19 +130,20 @@ def read_input(
 
 
 def _from_array(path: Path, rig_path: Path | None, saturation: float | None, frame: int | None) -> RawInput:
-    raw = _load(path)
-    raw = raw[None] if raw.ndim == 3 else raw
+    held = _load(path)
+    raw = held["raw"][None] if held["raw"].ndim == 3 else held["raw"]
     rig = load_rig(rig_path) if rig_path else None
     camera = rig.tof if rig else NOMINAL_CAMERA
-    _check_shape(raw, camera, path)
-    limit = SATURATION if saturation is None else saturation
-    celsius = np.full(len(raw), np.nan)
-    taps, _ = taken(raw, frame, limit, celsius)
-    expect_finite(taps, f"{path}{_which(raw, frame)}")
-    warning = _check_unit(raw, limit, path)
-    plain = TofInfo("array", "", camera, rig.illuminator if rig else np.zeros(3), saturation=limit)
+    plain = _described(held, camera, saturation, path)
     if rig:
-        info, assumed = replace(plain, range_errors=rig.range_errors), ""
+        plain = replace(plain, illuminator=rig.illuminator, range_errors=rig.range_errors, reach=rig.reach)
+    _check_shape(raw, plain, path)
+    celsius = np.full(len(raw), np.nan)
+    taps, _ = taken(raw, frame, plain, celsius)
+    expect_finite(taps, f"{path}{_which(raw, frame)}")
+    warning = _check_unit(raw, plain, path)
+    if rig:
+        info, assumed = plain, ""
         check_taps(taps, info, path, _which(raw, frame))
     else:
         info, words = _without_rig(taps, plain, path, _which(raw, frame))
@@ -149,21 +151,45 @@ def _from_array(path: Path, rig_path: Path | None, saturation: float | None, fra
     return RawInput(raw, celsius, info, camera, str(path), assumed, warning if saturation is None else "")
 
 
-def _load(path: Path) -> NDArray[Any]:
-    """Read the array of a ``.npy`` or a ``.npz``, whatever the file is called."""
+def _described(
+    held: dict[str, NDArray[Any]], camera: Camera, saturation: float | None, path: Path
+) -> TofInfo:
+    """Take the channels that lie beside the array, or the paper's camera's."""
+    said = {
+        k: held[k].reshape(-1) for k in ("modulation_hz", "phase_rad", "offset", "saturation") if k in held
+    }
+    try:
+        channels = {k: tuple(map(float, said[k])) for k in ("modulation_hz", "phase_rad") if k in said}
+        limit = SATURATION if saturation is None else saturation
+        return TofInfo(
+            "array", "", camera, np.zeros(3), **channels, offset=bool(said.get("offset", [True])[0]),
+            saturation=float(said["saturation"][0]) if "saturation" in said and saturation is None else limit,
+        )  # fmt: skip
+    except DataError as err:
+        raise DataError(f"{path}: {err.message}", err.hint) from err
+    except (TypeError, ValueError, IndexError) as err:
+        hint = "np.savez(path, raw=raw, modulation_hz=hz, phase_rad=phases), one number a channel"
+        raise DataError(
+            f"{path}: the channels that lie beside the array are no numbers: {err}", hint
+        ) from err
+
+
+def _load(path: Path) -> dict[str, NDArray[Any]]:
+    """Read the array of a ``.npy`` or a ``.npz`` as ``raw``, with what lies beside it; whatever the file is called."""
     try:
         found = np.load(path, allow_pickle=False)
         if isinstance(found, np.ndarray):
-            return found
+            return {"raw": found}
         with found:
-            names = found.files
-            name = "raw" if "raw" in names else names[0] if len(names) == 1 else ""
-            if name:
-                return np.asarray(found[name])
+            held = {name: np.asarray(found[name]) for name in found.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as err:
         raise DataError(f"{path}: cannot read the array: {err}", hint="write it with np.save") from err
+    if len(held) == 1:
+        return {"raw": next(iter(held.values()))}
+    if "raw" in held:
+        return held
     raise DataError(
-        f"{path}: expected one array, or one that is called raw, got {', '.join(names) or 'none'}",
+        f"{path}: expected one array, or one that is called raw, got {', '.join(held) or 'none'}",
         hint="np.savez(path, raw=raw)",
     )
 
@@ -173,6 +199,8 @@ def _without_rig(taps: NDArray[np.float64], plain: TofInfo, path: Path, which: s
     try:
         check_taps(taps, plain, path, which)
     except DataError as err:
+        if frequencies(plain.modulation_hz) != tuple(e.modulation_hz for e in NOMINAL_RANGE_ERRORS):
+            raise
         known = replace(plain, range_errors=NOMINAL_RANGE_ERRORS)
         try:
             check_taps(taps, known, path, which)
@@ -182,19 +210,23 @@ def _without_rig(taps: NDArray[np.float64], plain: TofInfo, path: Path, which: s
     return plain, "no range errors"
 
 
-def _check_shape(raw: NDArray[Any], camera: Camera, path: Path) -> None:
-    """Refuse anything but (F, 8, H, W) numbers of more than 8 bits."""
-    h, w = camera.shape
+def _check_shape(raw: NDArray[Any], info: TofInfo, path: Path) -> None:
+    """Refuse anything but (F, K, H, W) numbers of more than 8 bits."""
+    (h, w), K = info.camera.shape, len(info.modulation_hz)
     shape = raw.shape[1:] if raw.ndim == 4 and len(raw) > 0 else ()
-    if shape == (8, h, w) and raw.dtype.kind in "uif" and raw.dtype.itemsize > 1:
+    if shape == (K, h, w) and raw.dtype.kind in "uif" and raw.dtype.itemsize > 1:
         return
     hints = {
-        (h, w, 8): "np.moveaxis(raw, -1, -3) puts the channels before rows and columns",
-        (8, w, h): "np.swapaxes(raw, -1, -2) puts the rows before the columns",
-        (8, h, w): "counts as the sensor gives them, such as uint16",
+        (h, w, K): "np.moveaxis(raw, -1, -3) puts the channels before rows and columns",
+        (K, w, h): "np.swapaxes(raw, -1, -2) puts the rows before the columns",
+        (K, h, w): "counts as the sensor gives them, such as uint16",
     }
+    if len(shape) == 3 and shape[1:] == (h, w):
+        hints[shape] = (
+            f"other channels than {channels_in_words(info.modulation_hz, info.phase_rad)} are said beside the array: np.savez(path, raw=raw, modulation_hz=hz, phase_rad=phases)"
+        )
     raise DataError(
-        f"{path}: expected numbers of shape (8, {h}, {w}) or (F, 8, {h}, {w}), "
+        f"{path}: expected numbers of shape ({K}, {h}, {w}) or (F, {K}, {h}, {w}), "
         f"got {raw.dtype} {raw.shape[1:] if raw.shape[:1] == (1,) else raw.shape}",
         hint=hints.get(shape, "--rig names a camera of another size"),
     )
@@ -209,9 +241,9 @@ def expect_finite(raw: NDArray[Any], where: str) -> None:
         )
 
 
-def _check_unit(raw: NDArray[Any], saturation: float, path: Path) -> str:
+def _check_unit(raw: NDArray[Any], info: TofInfo, path: Path) -> str:
     """Refuse counts that this sensor cannot give; say what is suspicious, but a dark frame has low counts too."""
-    largest = float(raw[np.isfinite(raw)].max())
+    largest, saturation = float(np.abs(raw[np.isfinite(raw)].astype(np.float64)).max()), info.saturation
     bits = math.ceil(math.log2(max(largest, 1) + 1))
     if largest > saturation:
         raise DataError(
@@ -227,11 +259,12 @@ def _check_unit(raw: NDArray[Any], saturation: float, path: Path) -> str:
 
 
 def check_taps(raw: NDArray[np.float64], info: TofInfo, path: Path, which: str = "") -> None:
-    """Refuse taps (8, H, W) that cannot be what ``info`` says: other units, other channels, no signal.
+    """Refuse taps (K, H, W) that cannot be what ``info`` says: other units, other channels, no signal.
 
-    ``C_0 - C_1 + C_2 - C_3`` vanishes for the right order; ranges of both frequencies agree up to noise and calibration; depths
-    lie within the reach of the rig. Looked at are the brighter half of the pixels below saturation, and the bounds are wide. A
-    start tap that is wrong by the same quarter in both frequencies passes: no frame can tell. ``path`` and ``which`` are names.
+    What no cosine explains vanishes for the right order, where a frequency has four phases. Ranges of all frequencies agree up to
+    noise and calibration. Depths lie within the reach of the rig. Looked at are the brighter half of the pixels below saturation,
+    and the bounds are wide. A start tap that is wrong by the same quarter in all frequencies passes: no frame can tell. ``path``
+    and ``which`` are names.
 
     Raises
     ------
@@ -239,44 +272,46 @@ def check_taps(raw: NDArray[np.float64], info: TofInfo, path: Path, which: str =
         With what was found, and what to try.
     """
     where = f"{path}{which}"
-    _check_counts(raw, info.saturation, where)
+    _check_counts(raw, info, where)
     maps, signals = Decoder(info).signals(raw)
     amplitude = np.hypot(signals.phasor[:, 0], signals.phasor[:, 1])
-    weaker = np.where(raw.max(axis=0) < info.saturation, amplitude.min(axis=0), np.nan)
+    weaker = np.where(info.saturated(raw).any(axis=0), np.nan, amplitude.min(axis=0))
     bright = (weaker >= np.nanmedian(weaker)) & (weaker > 0)
     if not bright.any():
-        raise DataError(f"{where}: no modulated light: the four phases are equal everywhere")
+        raise DataError(f"{where}: no modulated light: the phases are equal everywhere")
     found = _contradiction(
-        raw[:, bright], amplitude[:, bright], signals.gap[bright], maps.depth[bright], info
+        raw[:, bright], amplitude[:, bright], signals.ranges[:, bright], maps.depth[bright], info
     )
     if found:
         hint = f"tofcapture calibrate phase-order {path} says what the channels are; reorder them"
         raise DataError(
-            f"{where}: {found}; expected channels: {CHANNELS}",
+            f"{where}: {found}; expected channels: {channels_in_words(info.modulation_hz, info.phase_rad)}",
             hint=f"{hint}; or take another --frame, or --average, if only this one is so" if which else hint,
         )
 
 
 def _contradiction(
-    raw: NDArray[np.float64], amplitude: Float32, gap: Float32, depth: Float32, info: TofInfo
+    raw: NDArray[np.float64], amplitude: Float32, ranges: Float32, depth: Float32, info: TofInfo
 ) -> str:
-    """Say what of taps (8, N), amplitudes (2, N), gaps (N,) and depths (N,) cannot be; nothing when all is well."""
-    taps = raw.reshape(2, 4, -1)
-    second = np.abs(taps[:, 0] - taps[:, 1] + taps[:, 2] - taps[:, 3])
-    harmonic = np.median(second / amplitude, axis=1).max()
-    if harmonic > _HARMONIC:
-        return f"taps half a period apart do not add up, by {harmonic:.1f} of the amplitude"
-    wrap = ambiguity(frequencies(info.modulation_hz)[1])
-    agreement = np.cos(2 * np.pi * gap / wrap).mean()
+    """Say what of taps (K, N), amplitudes (F, N), ranges (F, N) and depths (N,) cannot be; nothing when all is well."""
+    rows, hz = tap_rows(info), frequencies(info.modulation_hz)
+    for size, (first, count) in zip(amplitude, rows.spare, strict=True):
+        spare = rows.weights[first : first + count] @ raw
+        harmonic = float(np.median(2 * np.sqrt(np.square(spare).mean(axis=0)) / size)) if count else 0.0
+        if harmonic > _HARMONIC:
+            return f"taps half a period apart do not add up, by {harmonic:.1f} of the amplitude"
+    apart = wrap_table(hz, information(info), info.reach).apart
+    agreement = float(np.cos(2 * np.pi * np.minimum(mismatch(ranges.T, hz) / apart, 0.5)).mean())
     if agreement < _AGREEMENT:
-        return f"the ranges of the two frequencies contradict each other (agreement {agreement:.2f} of 1)"
+        return f"the ranges of the frequencies contradict each other (agreement {agreement:.2f} of 1)"
     within = ((depth > _REACH[0]) & (depth < _REACH[1])).mean()
     if within < _WITHIN:
         return f"only {within:.0%} of the bright pixels decode to between {_REACH[0]} and {_REACH[1]} m"
     return ""
 
 
-def _check_counts(raw: NDArray[np.float64], saturation: float, where: str) -> None:
+def _check_counts(raw: NDArray[np.float64], info: TofInfo, where: str) -> None:
+    saturation, raw = info.saturation, np.abs(raw)
     unit = f"counts of a sensor that saturates at {saturation:g}"
     if raw.max() <= 0:
         raise DataError(

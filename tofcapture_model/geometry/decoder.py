@@ -12,19 +12,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from tofcapture.camera import Camera
+from tofcapture.channels import ambiguity, frequencies, wrap_table
 from tofcapture.errors import DataError
 from tofcapture.frames import TofInfo
-from tofcapture.ops.phase import Decoder, ambiguity, frequencies
-from tofcapture.ops.phase.decoder import UNKNOWN_CELSIUS
-from tofcapture.ops.phase.float32 import Correction, tap_weights
+from tofcapture.ops.phase import TapNoise, information
+from tofcapture.ops.phase.decoder import RADIUS
+from tofcapture.ops.phase.float32 import SURE, UNLIKELY, Correction, tap_rows
+from tofcapture.ops.phase.reference import UNKNOWN_CELSIUS
 from tofcapture.rig import RangeError
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
 from tofcapture_model.geometry.maps import expect_usable, intrinsics_of
 
 _HELD = 1 << 25  # elements of the table of distances
+_TINY = 1e-30
 
 
 class Taps(NamedTuple):
@@ -45,53 +48,51 @@ class _Range:
         self.per_kelvin, self.reference, self.dark = tables.per_kelvin, tables.reference, float(tables.dark)
 
     def __call__(self, in_phase: Tensor, quadrature: Tensor, amplitude: Tensor, celsius: Tensor) -> Tensor:
-        """Compute the range (H, W), metres, without what is known of its systematic error."""
+        """Compute the range (H, W) within one ambiguity, metres, without what is known of its systematic error."""
         turns = torch.atan2(quadrature, in_phase) / (2 * math.pi)
         steps = (turns - torch.floor(turns)) * (self.unambiguous / self.step) - self.fixed
         if self.dark:
-            steps = steps - self.dark / amplitude
+            steps = steps - self.dark / (amplitude + _TINY)
         if self.per_kelvin:
             steps = steps - self.per_kelvin * (celsius - self.reference)
         if self.table is None:
-            return steps * self.step + self.start
-        # no light has no phase, and none by amplitude: any entry will do
-        entry = torch.nan_to_num(steps, nan=0.0).clamp(0, len(self.table) - 1).to(torch.int64)
-        return steps * self.step + self.table[entry]
+            range_ = steps * self.step + self.start
+        else:
+            entry = torch.nan_to_num(steps, nan=0.0).clamp(0, len(self.table) - 1).to(torch.int64)
+            range_ = steps * self.step + self.table[entry]
+        return range_ - torch.floor(range_ / self.unambiguous) * self.unambiguous
 
 
 class TorchDecoder:
-    """Decodes single frames of one camera on a device; arguments as for :func:`tofcapture_model.data.make_frame`.
-
-    Raises
-    ------
-    DataError
-        There are not exactly two frequencies in a whole ratio, or phases that determine no phasor.
-    """
+    """Decodes single frames of one camera on a device; arguments as for :func:`tofcapture_model.data.make_frame`."""
 
     def __init__(self, info: TofInfo, camera: Camera, device: torch.device) -> None:
-        Decoder(replace(info, camera=camera))  # refuses what cannot be decoded
         expect_usable(camera)
-        low, high = frequencies(info.modulation_hz)
+        info = replace(info, camera=camera)
+        hz, known = frequencies(info.modulation_hz), information(info)
         errors = {e.modulation_hz: e for e in info.range_errors}
-        self._low, self._high = (_Range(errors.get(f, RangeError(f)), camera, device) for f in (low, high))
-        # fusion leans on the high frequency by f^2: inverse variance at equal phase noise
-        self._lean = high**2 / (low**2 + high**2)
-        self._unambiguous = ambiguity(low), ambiguity(high)
-        self._saturation = info.saturation
+        self._range = [_Range(errors.get(f, RangeError(f)), camera, device) for f in hz]
+        self._wraps, self._noise = wrap_table(hz, known, info.reach), TapNoise()
+        self._info, self._frequencies = info, len(hz)
         place = np.asarray(info.illuminator, dtype=np.float64)
         self._quarter, self._nearest = float(place @ place / 4), float(np.sqrt(place @ place) / 2)
 
         def there(array: NDArray[Any]) -> Tensor:
             return torch.tensor(array, dtype=torch.float32, device=device)
 
+        U = np.array([ambiguity(f) for f in hz])
         self._length, self._slant = there(camera.ray_lengths), there(camera.rays @ place / 2)
-        self._demodulation = there(tap_weights(info)[[0, 2, 1, 3]])
-        self._modulation = there(np.array([low, high]))
+        self._rows = there(tap_rows(info).weights[: 2 * len(hz) + 1])
+        self._lengths, self._lean = there(self._wraps.lengths), there(self._wraps.lean)[:, None, None]
+        self._unambiguous, self._weight = (
+            there(x)[:, None, None] for x in (U, np.square(2 * np.pi / U) * known)
+        )
+        self._demodulation, self._modulation = demodulation(info).to(device), modulation(info).to(device)
         self._intrinsics = intrinsics_of(camera).to(device)
 
     def taps(self, raw: NDArray[Any], celsius: float) -> Taps:
         """Send one frame (K, H, W), any real dtype, and its temperature to the device; :class:`DataError` for another shape."""
-        expected = (self._demodulation.shape[1], *self._length.shape)
+        expected = (self._rows.shape[1], *self._length.shape)
         if raw.shape != expected:
             raise DataError(f"decode: expected raw of shape {expected}, got {raw.shape}")
         device = self._length.device
@@ -102,35 +103,102 @@ class TorchDecoder:
 
     def __call__(self, taps: Taps) -> Frame:
         """Decode one frame: a batch of one, without cues."""
-        raw = taps.raw
+        raw, F = taps.raw, self._frequencies
         known = taps.celsius.isfinite()
         celsius = torch.where(known, taps.celsius, torch.full_like(taps.celsius, UNKNOWN_CELSIUS))
         # no matrix product: TF32, where somebody allows it, would round counts of 12 bits to 11
-        phasor = (self._demodulation[:, :, None, None] * raw).sum(1)
-        amplitude = torch.stack([phasor[:2], phasor[2:]]).square().sum(1).sqrt()
-        low = self._low(phasor[0], phasor[1], amplitude[0], celsius)
-        high = self._high(phasor[2], phasor[3], amplitude[1], celsius)
-        gap = (low - high) / self._unambiguous[1]
-        gap = (gap - torch.round(gap)) * self._unambiguous[1]
-        fused = low - gap * self._lean
-        fused = fused - torch.floor(fused / self._unambiguous[0]) * self._unambiguous[0]
-        depth = (fused.square() - self._quarter) / (fused * self._length - self._slant)
+        rows = (self._rows[:, :, None, None] * raw).sum(1)
+        real, imag = rows[:F], rows[F : 2 * F]
+        amplitude = (real.square() + imag.square()).sqrt()
+        ranges = torch.stack(
+            [r(*x, celsius) for r, *x in zip(self._range, real, imag, amplitude, strict=True)]
+        )
+        mean = rows[2 * F] if self._info.offset else amplitude[-1]
+        variance = mean / self._noise.electrons_per_unit + (self._noise.read**2 + 1e-12)
         lit = amplitude.amin(0) > 0
-        sure = lit & (raw.amax(0) < self._saturation) & (fused > self._nearest)
-        valid = sure & (depth > MIN_RANGE) & (depth < MAX_RANGE)  # false where it is no number
+        saturation = self._info.saturation
+        sure = lit & (raw.amax(0) < saturation) & (raw.amin(0) > -saturation)
+        which = self._unwrapped(ranges, amplitude, variance, sure)
+        unwrapped = ranges + self._lengths[which].movedim(-1, 0)
+        fused = (self._lean * unwrapped).sum(0)
+        start, period = self._wraps.start, self._wraps.period
+        fused = fused - torch.floor((fused - start) / period) * period
+        depth = (fused.square() - self._quarter) / (fused * self._length - self._slant)
+        valid = (
+            sure & (fused > self._nearest) & (depth > MIN_RANGE) & (depth < MAX_RANGE)
+        )  # false where it is no number
+        gap = torch.where(lit, unwrapped[0] - unwrapped[-1], torch.zeros_like(fused))
+        ends = [0, F, F - 1, 2 * F - 1]
         frame = Frame(
-            raw=raw / self._saturation,
-            phasor=phasor / self._saturation,
+            raw=raw / saturation,
+            phasor=torch.stack([rows[i] for i in ends]) / saturation,
             depth=fill_nearest(depth, valid)[None],
             valid=valid[None].to(raw),
-            confidence=amplitude[1:] / self._saturation,
-            gap=torch.where(lit, gap, torch.zeros_like(gap))[None],
+            confidence=amplitude[-1:] / saturation,
+            gap=gap[None],
             cues=raw[:0],
             modulation=self._modulation,
             intrinsics=self._intrinsics,
             demodulation=self._demodulation,
         )
         return Frame(*(x[None] for x in frame))
+
+    def _unwrapped(self, ranges: Tensor, amplitude: Tensor, variance: Tensor, good: Tensor) -> Tensor:
+        """Choose wrap vectors (H, W) as :func:`tofcapture.ops.phase.float32.choose` and ``ask`` do."""
+        which, best, second = self._likeliest(ranges, amplitude.square())
+        pooled, power = self._pooled(ranges, amplitude * good, good)
+        found, _, _ = self._likeliest(pooled, power)
+        apart = ranges + self._lengths[found].movedim(-1, 0)
+        mine = self._misfit(apart - apart[-1], self._weight * amplitude.square())
+        unsure = (second - best < SURE * variance) & good
+        return torch.where(unsure & (mine - best <= UNLIKELY * variance), found, which)
+
+    @staticmethod
+    def _misfit(apart: Tensor, weight: Tensor) -> Tensor:
+        """Compute chi squared times a tap's variance, (H, W), of how far ranges (F, H, W) are from the highest one's."""
+        linear = (weight * apart).sum(0)
+        return (weight * apart.square()).sum(0) - linear.square() / (weight.sum(0) + _TINY)
+
+    def _likeliest(self, ranges: Tensor, power: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Find the best wrap vector (H, W), its misfit and the second one's."""
+        apart, weight = ranges - ranges[-1], self._weight * power
+        best = second = torch.full_like(ranges[0], math.inf)
+        which = torch.zeros_like(ranges[0], dtype=torch.int64)
+        for j, lengths in enumerate(self._lengths - self._lengths[:, -1:]):
+            misfit = self._misfit(apart + lengths[:, None, None], weight)
+            second = torch.minimum(second, torch.maximum(misfit, best))
+            which = torch.where(misfit < best, j, which)
+            best = torch.minimum(misfit, best)
+        return which, best, second
+
+    def _pooled(self, ranges: Tensor, amplitude: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
+        """Add up the phasors of each pixel's window on its own surface: ranges and power (F, H, W)."""
+        U, size = self._unambiguous, 2 * RADIUS + 1
+        maps = torch.cat([ranges, amplitude, good[None].to(ranges)])
+        around = nn.functional.unfold(maps[None], size, padding=RADIUS).reshape(
+            len(maps), size**2, *ranges.shape[1:]
+        )
+        there, strength, seen = around.split([len(ranges), len(ranges), 1])
+        farther = (there[-1] - ranges[-1]) / U[-1]
+        farther = farther - torch.floor(farther + 0.5)
+        alike = seen[0] * (0.5 + 0.5 * torch.cos(2 * math.pi * farther)).square()
+        angle = 2 * math.pi * (there - farther * U[-1]) / U[:, None]
+        real, imag = ((strength * alike * wave(angle)).sum(1) for wave in (torch.cos, torch.sin))
+        turns = torch.atan2(imag, real) / (2 * math.pi)
+        pooled = torch.cat([((turns - torch.floor(turns)) * U)[:-1], ranges[-1:]])
+        return pooled, (real.square() + imag.square()) / (alike.square().sum(0) + _TINY)
+
+
+def demodulation(info: TofInfo) -> Tensor:
+    """Compute weights (4, K) that turn taps into I and Q of the lowest, then of the highest frequency."""
+    F = len(frequencies(info.modulation_hz))
+    return torch.tensor(tap_rows(info).weights[[0, F, F - 1, 2 * F - 1]], dtype=torch.float32)
+
+
+def modulation(info: TofInfo) -> Tensor:
+    """Return the lowest and the highest modulation frequency (2,), Hz; a camera of one frequency has it twice."""
+    hz = frequencies(info.modulation_hz)
+    return torch.tensor([hz[0], hz[-1]], dtype=torch.float32)
 
 
 def fill_nearest(image: Tensor, valid: Tensor) -> Tensor:

@@ -17,7 +17,6 @@ from torch import Tensor
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.frames import TofInfo
-from tofcapture.ops.phase import frequencies
 from tofcapture_model.config import BASELINES
 from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
 from tofcapture_model.data.raw_input import RawInput, expect_finite, read_input, taken
@@ -113,7 +112,7 @@ class Predictor:
     def _prepare(self, info: TofInfo, camera: Camera) -> _Prepared:
         key = (
             camera, tuple(info.modulation_hz), tuple(info.phase_rad), tuple(map(float, info.illuminator)),
-            info.saturation, tuple(info.range_errors),
+            info.saturation, tuple(info.range_errors), info.offset, info.reach,
         )  # fmt: skip
         prepared = self._prepared.pop(key, None)
         if prepared is None:
@@ -134,7 +133,7 @@ class Predictor:
 
     def _on_the_device(self, info: TofInfo, camera: Camera) -> _Prepared:
         """Copy the taps, and launch all the rest at once."""
-        decoder, high = TorchDecoder(info, camera, self._device), frequencies(info.modulation_hz)[1]
+        decoder, high = TorchDecoder(info, camera, self._device), max(info.modulation_hz)
 
         def ask(taps: Taps) -> tuple[Tensor, ...]:
             frame = with_cues(decoder(taps), high)
@@ -151,7 +150,7 @@ def _image(tensor: Tensor) -> Float32:
 
 def _nothing(raw: NDArray[Any], info: TofInfo, where: str) -> DataError:
     """Say of a frame that has no depth anywhere why that may be."""
-    share = float((raw.max(axis=0) >= info.saturation).mean())
+    share = float(info.saturated(raw).any(axis=0).mean())
     what = f"{share:.0%} of them are saturated" if share else "no light, or none that was modulated"
     return DataError(
         f"{where}: expected pixels that measure a depth between {MIN_RANGE:g} and {MAX_RANGE:g} m, got none of {raw[0].size}: {what}",
@@ -172,7 +171,7 @@ def predict_raw(
 
     ``timed`` decodes and asks ten times, and tells how long it takes.
     """
-    raw, celsius = taken(data.raw, frame, data.info.saturation, data.celsius)
+    raw, celsius = taken(data.raw, frame, data.info, data.celsius)
     predictor = Predictor(weights, device, backend)
     watch = _timed if timed else _untimed
     return predictor._answer(raw, data.info, data.camera, celsius, data.named(frame) or "raw frame", watch)  # noqa: SLF001

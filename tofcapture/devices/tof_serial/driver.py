@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 _SETTINGS = ("port", "baud", "firmware", "description")
 _DESCRIPTION = (
     "model", "serial", "camera", "illuminator", "modulation_hz", "phase_rad", "exposure", "saturation", "range_errors",
+    "offset", "reach",
 )  # fmt: skip
 _BAUD = 921_600
 _SMALLEST, _LARGEST = 512, 16384  # bytes of a chunk

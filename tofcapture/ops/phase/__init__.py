@@ -6,13 +6,13 @@ complex number ``A exp(i phi)``. Bursts are averaged as phasors, never as phases
 :class:`Decoder` turns taps into depth at more than a thousand frames a second.
 """
 
-from tofcapture.ops.phase.decoder import Decoder, DepthMaps, Signals, flying_pixels, unwrap, unwrap_spatial
+from tofcapture.channels import ambiguity, frequencies
+from tofcapture.ops.phase.decoder import Decoder, DepthMaps, Signals, flying_pixels
 from tofcapture.ops.phase.phasors import (
     Complex128,
     Float64,
     TapNoise,
-    ambiguity,
-    frequencies,
+    information,
     mean_phasors,
     phasors,
     photon_transfer,
@@ -32,13 +32,12 @@ __all__ = [
     "ambiguity",
     "flying_pixels",
     "frequencies",
+    "information",
     "mean_phasors",
     "phasors",
     "photon_transfer",
     "radial_to_range",
     "radius_px",
     "taps",
-    "unwrap",
-    "unwrap_spatial",
     "wrapped_range",
 ]

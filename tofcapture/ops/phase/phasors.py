@@ -13,44 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
+from tofcapture.channels import SPEED_OF_LIGHT, frequencies, solution
 from tofcapture.errors import DataError
-from tofcapture.rig import SPEED_OF_LIGHT
+from tofcapture.frames import TofInfo
 
 Float64 = NDArray[np.float64]
 Complex128 = NDArray[np.complex128]
 
 
-def frequencies(modulation_hz: Sequence[float]) -> tuple[float, ...]:
-    """Sort the distinct modulation frequencies, ascending."""
-    return tuple(sorted({float(f) for f in modulation_hz}))
-
-
-def ambiguity(modulation_hz: float) -> float:
-    """Compute the unambiguous range ``c / 2f``, metres: 7.49481145 at 20 MHz, 1.49896229 at 100 MHz."""
-    return SPEED_OF_LIGHT / (2 * modulation_hz)
-
-
-def solution(
-    modulation_hz: Sequence[float], phase_rad: Sequence[float], hz: float
-) -> tuple[NDArray[np.int64], Float64]:
-    """Solve for the channels (n,) of one frequency, and their least-squares weights (3, n).
-
-    The weights times those taps give ``B``, ``A cos phi`` and ``-A sin phi``; :class:`DataError` when the phases do not
-    determine a phasor.
-    """
-    theta = np.asarray(phase_rad, dtype=np.float64)
-    k = np.flatnonzero(np.asarray(modulation_hz, dtype=np.float64) == hz)
-    design = np.stack([np.ones(len(k)), np.cos(theta[k]), np.sin(theta[k])], axis=1)
-    if len(k) < 3 or np.linalg.cond(design) > 1e3:
-        raise DataError(
-            f"{hz / 1e6:g} MHz: the phases {np.degrees(theta[k]).tolist()} deg do not determine a phasor"
-        )
-    # Rounded, so that a half is a half: of equal taps nothing is left, not 1e-14 on either side of a wrap.
-    weights: Float64 = np.linalg.pinv(design).round(15)
-    return k, weights
-
-
-def phasors(raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequence[float]) -> Complex128:
+def phasors(
+    raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequence[float], *, offset: bool = True
+) -> Complex128:
     """Fit the phasor of each frequency by least squares: (..., F, H, W), ``A exp(i phi)``, frequencies ascending.
 
     Raises :class:`DataError` when channels and descriptions disagree, or the phases of a frequency do not determine a
@@ -62,6 +35,8 @@ def phasors(raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequen
         (..., K, H, W) taps, any real dtype, in any order of channels.
     modulation_hz, phase_rad
         (K,) frequency and demodulation phase of each channel.
+    offset
+        Taps carry an offset, which is fitted; I and Q alone do not.
     """
     if raw.shape[-3] != len(modulation_hz) or len(modulation_hz) != len(phase_rad):
         raise DataError(
@@ -69,15 +44,17 @@ def phasors(raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequen
         )
     out = []
     for hz in frequencies(modulation_hz):
-        k, solve = solution(modulation_hz, phase_rad, hz)
+        k, solve = solution(modulation_hz, phase_rad, hz, offset=offset)
         taps = np.moveaxis(raw[..., k, :, :], -3, -1).astype(np.float64)
         out.append(taps @ (solve[1] - 1j * solve[2]))
     return np.stack(out, axis=-3)
 
 
-def mean_phasors(raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequence[float]) -> Complex128:
+def mean_phasors(
+    raw: NDArray[Any], modulation_hz: Sequence[float], phase_rad: Sequence[float], *, offset: bool = True
+) -> Complex128:
     """Average a burst (frames, K, H, W) over its frames as I and Q: phasors (F, H, W)."""
-    return phasors(raw.mean(axis=0, dtype=np.float64), modulation_hz, phase_rad)
+    return phasors(raw.mean(axis=0, dtype=np.float64), modulation_hz, phase_rad, offset=offset)
 
 
 def taps(
@@ -90,6 +67,18 @@ def taps(
         for hz, theta in zip(modulation_hz, phase_rad, strict=True)
     ]
     return np.stack(out)
+
+
+def information(info: TofInfo) -> Float64:
+    """Compute what each frequency (F,) tells of its phase, per power and tap variance: half its phases where these are evenly spread.
+
+    The variance of a phase is ``tap variance / (information * power)``, averaged over the turn.
+    """
+    weights = [
+        solution(info.modulation_hz, info.phase_rad, f, offset=info.offset)[1]
+        for f in frequencies(info.modulation_hz)
+    ]
+    return np.array([2 / np.square(w[1:]).sum() for w in weights])
 
 
 def wrapped_range(phasor: Complex128, modulation_hz: float) -> Float64:

@@ -1,0 +1,201 @@
+"""Channels of a ToF camera as data: what its frequencies and phases determine, before any image is seen.
+
+Channel k is ``C_k = B + A cos(phi + phase_k)`` of its frequency, or without ``B`` where taps carry no offset. A frequency f knows a
+range modulo ``U = c / 2f``. Ranges of several frequencies agree on a few vectors of wraps only, which :func:`wrap_table` lists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.errors import ConfigError, DataError
+
+Float64 = NDArray[np.float64]
+Reach = tuple[float, float]
+SPEED_OF_LIGHT = 299_792_458.0  # m/s, exact
+
+#: Standard deviations of noise between two wrap vectors, at 1 rad of noise in every phase, below which they pass for one.
+TOLD_APART = 0.5
+_MOST_WRAPS = 200  # of the highest frequency; as far as anybody looks who does not say how far
+_NOISE = 0.25  # wraps that noise may carry a range across a wrap's end
+
+
+def frequencies(modulation_hz: Sequence[float]) -> tuple[float, ...]:
+    """Sort the distinct modulation frequencies, ascending."""
+    return tuple(sorted({float(f) for f in modulation_hz}))
+
+
+def ambiguity(modulation_hz: float) -> float:
+    """Compute the unambiguous range ``c / 2f``, metres: 7.49481145 at 20 MHz, 1.49896229 at 100 MHz."""
+    return SPEED_OF_LIGHT / (2 * modulation_hz)
+
+
+def design(phase_rad: Sequence[float], *, offset: bool) -> Float64:
+    """Build the matrix (n, 3 or 2) that makes taps of ``B``, ``A cos phi`` and ``-A sin phi``; without an offset of the last two."""
+    theta = np.asarray(phase_rad, dtype=np.float64)
+    columns = [np.ones(len(theta))] * offset + [np.cos(theta), np.sin(theta)]
+    return np.stack(columns, axis=1)
+
+
+def solution(
+    modulation_hz: Sequence[float], phase_rad: Sequence[float], hz: float, *, offset: bool = True
+) -> tuple[NDArray[np.int64], Float64]:
+    """Solve for the channels (n,) of one frequency, and their least-squares weights (3, n).
+
+    The weights times those taps give ``B``, ``A cos phi`` and ``-A sin phi``; ``B`` is 0 without an ``offset``.
+    :class:`DataError` when the phases do not determine a phasor.
+    """
+    k = np.flatnonzero(np.asarray(modulation_hz, dtype=np.float64) == hz)
+    phases = np.asarray(phase_rad, dtype=np.float64)[k]
+    matrix = design(phases, offset=offset)
+    if len(k) < matrix.shape[1] or np.linalg.cond(matrix) > 1e3:
+        least = "three phases, spread over the turn" if offset else "two phases that are not opposite"
+        raise DataError(
+            f"{hz / 1e6:g} MHz: the phases {np.degrees(phases).round(3).tolist()} deg do not determine a phasor; expected at least "
+            f"{least}",
+            hint="two are enough where taps carry no offset, as I and Q do: offset = false" if offset else "",
+        )
+    # Rounded, so that a half is a half: of equal taps nothing is left, not 1e-14 on either side of a wrap.
+    weights = np.zeros((3, len(k)))
+    weights[0 if offset else 1 :] = np.linalg.pinv(matrix).round(15)
+    return k, weights
+
+
+def check_channels(
+    modulation_hz: Sequence[float],
+    phase_rad: Sequence[float],
+    *,
+    offset: bool,
+    reach: Reach | None,
+    where: str,
+) -> None:
+    """Refuse channels that nobody could decode, by name.
+
+    :class:`DataError`: none at all, not one phase for each frequency, numbers that are not finite, phases that determine no phasor,
+    a reach of ranges that is empty or longer than the frequencies tell apart.
+    """
+    K = len(modulation_hz)
+    if not K or len(phase_rad) != K:
+        raise DataError(
+            f"{where}: expected a phase for each of {K} channels, at least one, got {len(phase_rad)} phases"
+        )
+    if not (np.isfinite(modulation_hz).all() and min(modulation_hz) > 0 and np.isfinite(phase_rad).all()):
+        raise DataError(
+            f"{where}: expected frequencies above 0 Hz and finite phases, got {list(modulation_hz)} Hz, {list(phase_rad)} rad"
+        )
+    hz = frequencies(modulation_hz)
+    if min(hz) < 1e5:
+        raise DataError(f"{where}: expected frequencies in Hz, got {min(hz):g}", hint="20 MHz are 20e6")
+    for f in hz:
+        try:
+            solution(modulation_hz, phase_rad, f, offset=offset)
+        except DataError as err:
+            raise DataError(f"{where}: {err.message}", err.hint) from None
+    if reach is None:
+        return
+    low, high = reach
+    if not (np.isfinite(reach).all() and 0 <= low < high):
+        raise DataError(
+            f"{where}: expected a reach of two ranges in metres, ascending from 0, got {list(reach)}"
+        )
+    if high - low > unambiguous(hz) * (1 + 1e-9):
+        raise DataError(
+            f"{where}: {', '.join(f'{f / 1e6:g}' for f in hz)} MHz tell ranges apart over {unambiguous(hz):.3f} m only, "
+            f"and the reach is {low:g} to {high:g} m",
+            hint="state a shorter reach, or record with one more frequency",
+        )
+
+
+def mismatch(ranges: NDArray[np.floating], hz: Sequence[float]) -> Float64:
+    """Compute how far unwrapped ranges (..., F) of frequencies (F,) are from agreeing, as :data:`TOLD_APART` counts."""
+    return _fitted(np.asarray(ranges, dtype=np.float64), np.array([ambiguity(f) for f in hz]))[1]
+
+
+def _fitted(ranges: Float64, U: Float64) -> tuple[Float64, Float64]:
+    """Fit one range (...) to ranges (..., F) of equal phase noise, and say by how much it misfits."""
+    weight = np.square(2 * np.pi / U)
+    fitted = ranges @ weight / weight.sum()
+    return fitted, np.sqrt(np.square(ranges - fitted[..., None]) @ weight)
+
+
+def channels_in_words(modulation_hz: Sequence[float], phase_rad: Sequence[float]) -> str:
+    """Say what the channels are: "20 MHz at 0, 90, 180, 270 deg, then 100 MHz at 0, 90, 180, 270 deg"."""
+    runs: list[tuple[float, list[str]]] = []
+    for hz, phase in zip(modulation_hz, phase_rad, strict=True):
+        if not runs or runs[-1][0] != hz:
+            runs.append((hz, []))
+        runs[-1][1].append(f"{np.degrees(phase):.4g}")
+    return ", then ".join(f"{hz / 1e6:g} MHz at {', '.join(phases)} deg" for hz, phases in runs)
+
+
+def unambiguous(hz: Sequence[float]) -> float:
+    """Compute the range over which distinct frequencies (F,), Hz, tell all ranges apart, metres.
+
+    It is the least common multiple of their ambiguities where ratios are whole numbers. Where they are not, it is the range at
+    which two wrap vectors are closer than :data:`TOLD_APART`: 20.0 and 99.9 MHz are good for 7.50 m.
+    """
+    U = np.array([ambiguity(f) for f in hz])
+    if len(U) == 1:
+        return float(U[0])
+    top = np.arange(1, _MOST_WRAPS + 1)[:, None] * U.min()
+    range_, apart = _fitted(np.rint(top / U) * U, U)
+    same = np.flatnonzero(apart < TOLD_APART)
+    return float(range_[same[0]] if len(same) else range_[-1])
+
+
+class WrapTable(NamedTuple):
+    """Hold the consistent wrap vectors of a camera's F frequencies, ascending, within its reach."""
+
+    wraps: NDArray[np.int64]  #: (J, F)
+    lengths: Float64  #: (J, F) metres that each wrap vector adds to the wrapped ranges
+    lean: Float64  #: (F,) shares in the range: inverse variances at equal phase noise; their sum is 1
+    period: float  #: metres after which ranges look the same
+    start: float  #: metres; ranges are given from here over one period
+    apart: float  #: closest two vectors, as :data:`TOLD_APART` counts; infinite when there is one
+
+
+def wrap_table(hz: Sequence[float], information: Sequence[float], reach: Reach | None = None) -> WrapTable:
+    """List the wrap vectors of frequencies (F,) that ranges of the ``reach``, metres, and some noise may show.
+
+    ``information`` (F,) is that of each phasor per power and tap variance: half the number of phases where they are evenly
+    spread. Without a reach it is all that the frequencies tell apart.
+    """
+    U = np.array([ambiguity(f) for f in hz])
+    period = unambiguous(hz)
+    low, high = reach or (0.0, period)
+    cells = []
+    for top in range(int(np.floor(low / U[-1] - _NOISE)), int(np.ceil(high / U[-1] + _NOISE))):
+        span = (np.array([top - _NOISE, top + 1 + _NOISE]) * U[-1]).clip(low, high)
+        others = [
+            range(int(np.floor(span[0] / u - _NOISE)), int(np.ceil(span[1] / u + _NOISE))) for u in U[:-1]
+        ]
+        cells += [(*n, top) for n in product(*others)]
+    n = np.array(cells, dtype=np.int64)
+    first, last = ((n - _NOISE) * U).max(axis=1), ((n + 1 + _NOISE) * U).min(axis=1)
+    overlap = np.minimum(last, high) - np.maximum(first, low)
+    n, overlap = n[overlap > 0], overlap[overlap > 0]
+    kept: list[int] = []
+    for j in np.argsort(-overlap, kind="stable"):
+        if not kept or _fitted((n[kept] - n[j]) * U, U)[1].min() >= TOLD_APART:
+            kept.append(int(j))
+    n = n[sorted(kept)]
+    gaps = [_fitted((n[:j] - n[j]) * U, U)[1].min() for j in range(1, len(n))]
+    weight = np.asarray(information) / np.square(U)
+    start = (low + high - period) / 2
+    return WrapTable(n, n * U, weight / weight.sum(), period, start, min(map(float, gaps), default=np.inf))
+
+
+def parse_reach(value: object, where: str) -> Reach | None:
+    """Read a ``reach``, two numbers or nothing; :class:`ConfigError` for anything else."""
+    if value is None:
+        return None
+    try:
+        low, high = value  # type: ignore[misc]
+        return float(low), float(high)
+    except (TypeError, ValueError) as err:
+        raise ConfigError(f"{where}: reach: expected two ranges in metres, got {value!r}") from err
