@@ -14,23 +14,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.board.fit import Model, clear_of_walls, on_front
+from calibration.registration.clouds import Mask
 from calibration.registration.gate import tukey_weights
-from tofcapture.camera import Camera
+from tofcapture.camera import LENS_NAMES, Camera, distorted, distortion_jacobian
 from tofcapture.errors import ConfigError, DataError, QualityError
 from tofcapture.poses import Float64, exp
 
 MIN_VIEWS = 5
 FEW = 500  # rims of a view; the rest repeats them
 SCALES = (3.0, 2.0, 1.2, 0.8, 0.8, 0.8)  # px, Tukey's scale, a step each
+TYPICAL = 4.0  # times the median distance: the least scale
 SETTLED = 0.002  # px, root mean square of what a step still moves
 MORE_STEPS = 12
-NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-STEP = np.array([0.01, 0.01, 0.01, 0.01, 1e-5, 1e-5, 1e-6, 1e-6, 1e-5])  # of a numerical derivative
+NAMES = ("fx", "fy", "cx", "cy", *LENS_NAMES)
+LENS = len(NAMES)  # numbers of a lens; the growth of plates stands behind them
 # One sigma of what a lens may be from where it starts: only what the views do not settle is held by it.
-PRIOR = np.array([30.0, 30.0, 15.0, 15.0, 0.5, 0.5, 0.01, 0.01, 0.5])
-MODELS = {"pinhole": 4, "k1 k2 p1 p2": 8, "k1 k2 p1 p2 k3": 9}
+PRIOR = np.array([30.0, 30.0, 15.0, 15.0, 0.5, 0.5, 0.01, 0.01, 0.5, *[0.5] * 3])
+MODELS = {"pinhole": 4, "k1 k2 p1 p2": 8, "k1 k2 p1 p2 k3": 9, "k1 k2 p1 p2 k3 k4 k5 k6": 12}
 BETTER = 0.98  # a richer lens must lower the error at left-out views to this share
+NEAR = 0.5  # px, root mean square, up to which a richer lens starts from a poorer one's answer
+SURER = 0.995  # the same where it also makes rays surer
 WORSE = 1.2  # times the first look's error: one of the boards found in addition is another one
+LOST = 2.0  # px: the most that one rim can say against a lens
 HALVINGS = 6  # of a step whose lens folds
 NOISE = 0.3  # px, of a rim, against the priors
 
@@ -58,7 +63,7 @@ class BoardLens:
 
     camera: Camera  #: The answer
     model: str  #: Which of ``MODELS`` the views ask for
-    sigma: Float64  #: (9,) one sigma of ``NAMES`` from leaving views out; 0 for what was held
+    sigma: Float64  #: (12,) one sigma of ``NAMES`` from leaving views out; 0 for what was held
     rms: float  #: Root mean square distance of rims to edges, pixels
     left_out: Float64  #: (V,) the same at each view with the lens of the others
     growth: float  #: How far rims lie off the material, pixels
@@ -78,12 +83,13 @@ class _Guess:
 
 @dataclass(frozen=True)
 class _Equations:
-    """One view's equations: of the lens and growth (N, 10), of the pose (N, 6), residual and weight (N,)."""
+    """One view's equations: of the lens and growth (N, 13), of the pose (N, 6), residual and weight (N,)."""
 
     shared: Float64
     own: Float64
     residual: Float64
     weight: Float64
+    usable: Mask  # (N,) the ray meets the board's front, clear of the walls of its holes
 
 
 def fit_lens(model: Model, look: Look, camera: Camera) -> tuple[BoardLens, list[str]]:
@@ -119,16 +125,13 @@ def fit_lens_to_board(model: Model, views: Sequence[BoardSeen], camera: Camera) 
             hint="record the board tilted 20 to 40 degrees in all directions, also in the corners of the image",
         )
     thin = [replace(v, pixels=v.pixels[:: max(1, len(v.pixels) // FEW)]) for v in views]
-    best: BoardLens | None = None
+    best, at = None, _Guess(camera, 0.0, tuple(v.T_camera_board for v in thin))
     for name, free in MODELS.items():
-        try:
-            found = _fit(model, thin, best.camera if best else camera, name, free)
-        except ConfigError:  # it folds: the views do not ask for that much lens
-            if best is None:
-                raise
-            break
-        if best is None or _rms(found.left_out) < BETTER * _rms(best.left_out):
-            best = found
+        found, there = _fit(model, thin, _saturating(at) if free == LENS else at, camera, name, free)
+        # Where rays become surer too, less will do.
+        share = SURER if best and found.pixel_sigma < best.pixel_sigma else BETTER
+        if best is None or _rms(found.left_out) < share * _rms(best.left_out):
+            best, at = found, there if found.rms < NEAR else at
     if best is None or best.rms > 1.0:
         raise LensRefused(
             f"lens refused, poor fit: rims lie {best.rms if best else np.nan:.2f} px off the board's edges, expected below 1",
@@ -138,8 +141,9 @@ def fit_lens_to_board(model: Model, views: Sequence[BoardSeen], camera: Camera) 
 
 
 def lens_values(camera: Camera) -> Float64:
-    """Return the (9,) numbers of ``NAMES``."""
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *(camera.distortion or (0.0,) * 5)])
+    """Return the (12,) numbers of ``NAMES``."""
+    known = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
+    return np.pad(known, (0, LENS - len(known)))
 
 
 def _camera(values: Float64, like: Camera) -> Camera:
@@ -147,12 +151,26 @@ def _camera(values: Float64, like: Camera) -> Camera:
     return Camera(like.width, like.height, fx, fy, cx, cy, tuple(distortion))
 
 
-def _fit(model: Model, views: Sequence[BoardSeen], start: Camera, name: str, free: int) -> BoardLens:
-    guess = _Guess(start, 0.0, tuple(v.T_camera_board for v in views))
-    begin = lens_values(start)
+def _saturating(guess: _Guess) -> _Guess:
+    """Start a rational lens near a polynomial barrel, as ``(1 + a r^2) / (1 + b r^2)``; with 9 a > b it folds nowhere."""
+    k1, k2, p1, p2, *_ = (*guess.camera.distortion, *(0.0,) * 5)
+    if k1 >= 0:
+        return guess
+    b = max(-k2 / k1, 0.0)  # the Pade approximant
+    a, b = (k1 + b, b) if 8 * (k1 + b) > b else (-k1 / 7, -8 * k1 / 7)
+    return replace(guess, camera=replace(guess.camera, distortion=(a, 0.0, p1, p2, 0.0, b, 0.0, 0.0)))
+
+
+def _fit(
+    model: Model, views: Sequence[BoardSeen], guess: _Guess, believed: Camera, name: str, free: int
+) -> tuple[BoardLens, _Guess]:
+    """Fit a model of ``free`` numbers from where the last one got to; what the views leave open is held at what was believed."""
+    begin = lens_values(believed)
 
     def linearised(scale: float) -> list[_Equations]:
-        return [_equations(model, v, T, guess, scale) for v, T in zip(views, guess.poses, strict=True)]
+        return _weighed(
+            [_equations(model, v, T, guess) for v, T in zip(views, guess.poses, strict=True)], scale
+        )
 
     for step in range(len(SCALES) + MORE_STEPS):
         equations = linearised(SCALES[min(step, len(SCALES) - 1)])
@@ -167,19 +185,27 @@ def _fit(model: Model, views: Sequence[BoardSeen], start: Camera, name: str, fre
     n = len(equations)
     spread = (n - 1) / n * (without - without.mean(axis=0)).T @ (without - without.mean(axis=0))
     pixels = np.concatenate([v.pixels for v in views])
-    return BoardLens(
+    fitted = BoardLens(
         camera=guess.camera,
         model=name,
-        sigma=np.sqrt(np.diag(spread))[:9],
-        rms=_rms(np.array([_left(e, np.zeros(10)) for e in equations])),
+        sigma=np.sqrt(np.diag(spread))[:LENS],
+        rms=_rms(np.array([_left(e, np.zeros(LENS + 1)) for e in equations])),
         left_out=np.array([_left(e, d) for e, d in zip(equations, without, strict=True)]),
         growth=guess.growth,
-        coverage=np.ptp(pixels, axis=0) / [start.width, start.height],
-        pixel_sigma=_pixel_sigma(guess.camera, spread[:9, :9]),
+        coverage=np.ptp(pixels, axis=0) / [believed.width, believed.height],
+        pixel_sigma=_pixel_sigma(guess.camera, spread[:LENS, :LENS]),
     )
+    return fitted, guess
 
 
-def _equations(model: Model, view: BoardSeen, T: Float64, guess: _Guess, scale: float) -> _Equations:
+def _weighed(equations: Sequence[_Equations], scale: float) -> list[_Equations]:
+    """Weigh rims by Tukey's rule; far from the answer most lie farther off than ``scale``, pixels, and none may be lost."""
+    off = np.abs(np.concatenate([e.residual[e.usable] for e in equations]))
+    scale = max(scale, TYPICAL * float(np.median(off))) if len(off) else scale
+    return [replace(e, weight=e.weight * tukey_weights(e.residual, scale)) for e in equations]
+
+
+def _equations(model: Model, view: BoardSeen, T: Float64, guess: _Guess) -> _Equations:
     camera = guess.camera
     rays = camera.rays_at(view.pixels)
     xy = on_front(T, model.board, rays)
@@ -193,26 +219,33 @@ def _equations(model: Model, view: BoardSeen, T: Float64, guess: _Guess, scale: 
     # The ray meets the front elsewhere when the ray or the board moves: the part along the ray keeps the point on the plane.
     slide = across - ((across * rays).sum(axis=1) / (rays @ n))[:, None] * n
     own = -np.column_stack([slide, np.cross(points, slide)])
-    by_lens = [(d * points[:, 2:] * slide).sum(axis=1) for d in _ray_derivatives(camera, view.pixels, rays)]
+    by_lens = [(d * points[:, 2:] * slide).sum(axis=1) for d in _ray_derivatives(camera, rays)]
     shared = np.column_stack([*by_lens, -np.ones(len(xy))])
     good = clear_of_walls(T, model.board, xy, edges.outward) & np.isfinite(residual)
-    weight = np.where(good, tukey_weights(np.nan_to_num(residual), scale), 0.0)
-    return _Equations(shared, own, np.nan_to_num(residual), weight)
+    return _Equations(shared, own, np.nan_to_num(residual), good.astype(np.float64), good)
 
 
-def _ray_derivatives(camera: Camera, pixels: Float64, rays: Float64) -> list[Float64]:
-    """Derivative (N, 3) of the rays through pixels (N, 2) by each number of the lens."""
-    out = []
-    for k, h in enumerate(STEP):
-        values = lens_values(camera)
-        values[k] += h
-        out.append((_camera(values, camera).rays_at(pixels) - rays) / h)
-    return out
+def _ray_derivatives(camera: Camera, rays: Float64) -> Float64:
+    """Derivative (12, N, 3) of the rays (N, 3) through fixed pixels by each number of the lens, by the implicit function theorem."""
+    c = np.pad(np.array(camera.distortion), (0, 8 - len(camera.distortion)))
+    xy, (x, y) = rays[:, :2], rays[:, :2].T
+    r2 = x * x + y * y
+    under = 1 + r2 * (c[5] + r2 * (c[6] + r2 * c[7]))
+    radial = (1 + r2 * (c[0] + r2 * (c[1] + r2 * c[4]))) / under
+    powers = np.stack([r2, r2**2, r2**3])
+    k = np.concatenate([powers / under, -powers * radial / under])[..., None] * xy
+    p1, p2 = np.stack([2 * x * y, r2 + 2 * y * y], axis=1), np.stack([r2 + 2 * x * x, 2 * x * y], axis=1)
+    goal = distorted(xy, c)
+    wide, high = np.array([1.0, 0.0]) / camera.fx, np.array([0.0, 1.0]) / camera.fy
+    middle = np.ones_like(xy)
+    moved = np.stack([goal * wide, goal * high, middle * wide, middle * high, k[0], k[1], p1, p2, *k[2:]])
+    inverse = np.linalg.pinv(distortion_jacobian(xy, c))  # where the image nearly folds it has no inverse
+    return np.pad(-np.einsum("nij,knj->kni", inverse, moved), ((0, 0), (0, 0), (0, 1)))
 
 
 def _solve(equations: Sequence[_Equations], away: Float64, free: int) -> Float64:
-    """Step (10,) of lens and growth, poses eliminated; what is not free stays."""
-    use = np.r_[np.arange(free), 9]
+    """Step (13,) of lens and growth, poses eliminated; what is not free stays."""
+    use = np.r_[np.arange(free), LENS]
     H = np.diag(np.r_[(NOISE / PRIOR) ** 2, 1e-3])
     g = np.r_[-((NOISE / PRIOR) ** 2) * away, 0.0]
     for e in equations:
@@ -220,25 +253,19 @@ def _solve(equations: Sequence[_Equations], away: Float64, free: int) -> Float64
         gain = (A * w).T @ B @ np.linalg.pinv((B * w).T @ B)
         H = H + (A * w).T @ A - gain @ ((B * w).T @ A)
         g = g - (A * w).T @ e.residual + gain @ ((B * w).T @ e.residual)
-    out = np.zeros(10)
+    out = np.zeros(LENS + 1)
     out[use] = np.linalg.solve(H[np.ix_(use, use)], g[use])
     return out
 
 
 def _without_fold(camera: Camera, delta: Float64) -> Float64:
-    """Halve a step (10,) until its lens does not fold; :class:`ConfigError` when the smallest does.
-
-    Far from the answer the first steps go too far.
-    """
-    for tried in range(HALVINGS + 1):
-        try:
-            _camera(lens_values(camera) + delta[:9], camera).rays  # noqa: B018  which inverts the lens at every pixel
-            break
-        except ConfigError:
-            if tried == HALVINGS:
-                raise
-            delta = delta / 2
-    return delta
+    """Halve a step (13,) until its lens does not fold, and take none where the smallest does: far from the answer steps go too far."""
+    for _ in range(HALVINGS):
+        with suppress(ConfigError):
+            _camera(lens_values(camera) + delta[:LENS], camera).rays_at(_grid(camera))
+            return delta
+        delta = delta / 2
+    return np.zeros_like(delta)
 
 
 def _pose_step(e: _Equations, delta: Float64) -> Float64:
@@ -248,27 +275,33 @@ def _pose_step(e: _Equations, delta: Float64) -> Float64:
 
 
 def _moved(guess: _Guess, delta: Float64, equations: Sequence[_Equations], free: int) -> _Guess:
-    values = lens_values(guess.camera) + np.where(np.arange(9) < free, delta[:9], 0.0)
+    values = lens_values(guess.camera) + np.where(np.arange(LENS) < free, delta[:LENS], 0.0)
     poses = tuple(exp(_pose_step(e, delta)) @ T for e, T in zip(equations, guess.poses, strict=True))
-    return _Guess(_camera(values, guess.camera), guess.growth + float(delta[9]), poses)
+    return _Guess(_camera(values, guess.camera), guess.growth + float(delta[LENS]), poses)
 
 
 def _left(e: _Equations, delta: Float64) -> float:
-    """RMS of a view's rims, its own pose fitted again after the lens has moved by ``delta``."""
+    """RMS of a view's rims, its own pose fitted again after the lens has moved by ``delta``; none counts as farther than ``LOST``."""
     left = e.residual + e.shared @ delta + e.own @ _pose_step(e, delta)
-    return float(np.sqrt((e.weight * left**2).sum() / max(e.weight.sum(), 1e-9)))
+    return (
+        float(np.sqrt(np.square(np.minimum(np.abs(left[e.usable]), LOST)).mean())) if e.usable.any() else LOST
+    )
 
 
 def _rms(values: Float64) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+def _grid(camera: Camera) -> Float64:
+    """Return pixels (N, 2) all over the image, its border with them."""
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 13), np.linspace(0, camera.height - 1, 9))
+    return np.stack([u.ravel(), v.ravel()], axis=1)
+
+
 def _pixel_sigma(camera: Camera, covariance: Float64) -> float:
     """Tell what the covariance means at the image's edge, once a turn of the camera, which no user sees, is taken off."""
-    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 7))
-    pixels, focal = np.stack([u.ravel(), v.ravel()], axis=1), [camera.fx, camera.fy]
-    rays = camera.rays_at(pixels)
-    J = np.stack([(d[:, :2] * focal).ravel() for d in _ray_derivatives(camera, pixels, rays)], axis=1)
+    rays, focal = camera.rays_at(_grid(camera)), [camera.fx, camera.fy]
+    J = np.stack([(d[:, :2] * focal).ravel() for d in _ray_derivatives(camera, rays)], axis=1)
     crossed = [np.cross(axis, rays) for axis in np.eye(3)]
     turned = np.stack([(c[:, :2] - rays[:, :2] * c[:, 2:]) * focal for c in crossed]).reshape(3, -1)
     J = J - turned.T @ np.linalg.lstsq(turned.T, J, rcond=None)[0]

@@ -11,7 +11,7 @@ import pytest
 from calibration.board.fit import Model, clear_of_walls
 from calibration.board.geometry import load_board
 from calibration.cli.sensor import lens_report, lens_table
-from calibration.lens import BoardSeen, fit_lens, fit_lens_to_board
+from calibration.lens import BoardSeen, LensRefused, fit_lens, fit_lens_to_board
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.cli import main
@@ -26,17 +26,17 @@ TRUE = Camera(240, 180, 191.5, 200.2, 117.9, 100.6, (-0.12, 0.05, 0.0008, -0.000
 GUESS = Camera(240, 180, 189.0, 202.5, 119.5, 98.5)
 
 
-def seen(camera, count=14, noise=0.15, growth=0.2, seed=0):
+def seen(camera, count=14, noise=0.15, growth=0.2, seed=0, far=(0.35, 0.8)):
     """Rims of tilted boards, seen through a lens, all plates too large by some of a pixel."""
     rng, out = np.random.default_rng(seed), []
     middle = np.r_[
         (MODEL.board.outline.max(axis=0) + MODEL.board.outline.min(axis=0)) / 2, MODEL.board.thickness
     ]
     for i in range(count):
-        tilt, turn, far = np.radians(rng.uniform(15, 40)), 2.4 * i, rng.uniform(0.35, 0.8)
+        tilt, turn, away = np.radians(rng.uniform(15, 40)), 2.4 * i, rng.uniform(*far)
         way = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
         aim = middle + np.r_[rng.uniform(-0.1, 0.1, 2), 0]
-        T = invert(look_at(aim + far * way, aim, up=[0, 1, 0], roll=rng.uniform(-1, 1)))
+        T = invert(look_at(aim + away * way, aim, up=[0, 1, 0], roll=rng.uniform(-1, 1)))
         xy = np.concatenate(
             [
                 np.linspace(a, b, 25, endpoint=False)
@@ -50,7 +50,7 @@ def seen(camera, count=14, noise=0.15, growth=0.2, seed=0):
         out_px = camera.project(at + 1e-4 * edges.outward @ T[:3, :2].T)[0] - camera.project(at)[0]
         pixels = camera.project(at)[0] + growth * out_px / np.linalg.norm(out_px, axis=1, keepdims=True)
         pixels += rng.normal(0, noise, pixels.shape)
-        good = clear & (pixels > 3).all(axis=1) & (pixels < [236, 176]).all(axis=1)
+        good = clear & (pixels > 3).all(axis=1) & (pixels < [camera.width - 4, camera.height - 4]).all(axis=1)
         off = poses.exp(np.r_[rng.normal(0, 0.003, 3), rng.normal(0, 0.01, 3)])
         out.append(BoardSeen(pixels[good][:: max(1, good.sum() // 300)], off @ T))
     return out
@@ -73,6 +73,28 @@ def test_the_lens_that_made_the_rims_comes_out():
         fit, Rig(GUESS, Camera(1280, 1024, 1155.0, 1155.0, 639.5, 511.5), np.eye(4), np.eye(4))
     )
     assert "fx" in lens_table({**data, "refused": []})
+
+
+def test_a_wide_rational_lens_comes_out():
+    """A field of view that four coefficients miss by pixels: the views ask for more, and inside what they cover it holds."""
+    wide = (3.130577, 2.324939, 8.1e-05, -5.1e-05, 0.130416, 3.458652, 3.350115, 0.662942)
+    true = Camera(240, 180, 130.0, 130.0, 118.0, 92.0, wide)
+    guess = Camera(240, 180, 131.3, 128.7, 120.0, 90.0)
+    fit = fit_lens_to_board(MODEL, seen(true, 10, far=(0.2, 0.6)), guess)
+    assert "k6" in fit.model
+    assert len(fit.camera.distortion) == 8
+    assert fit.rms < 0.25
+    v, u = np.mgrid[:180, :240]
+    inside = np.hypot(u - 118, v - 92) < 110
+    off = ((fit.camera.rays - true.rays)[..., :2] * 130)[inside]
+    assert np.abs(off - np.median(off, axis=0)).max() < 1.0
+
+
+def test_rims_that_no_lens_explains_are_refused():
+    """Rims of another board lie pixels off, and none of them is quietly left out."""
+    views = [replace(v, pixels=v.pixels + 6 * np.sin(v.pixels[:, ::-1])) for v in seen(TRUE, 6, noise=0.0)]
+    with pytest.raises(LensRefused, match="poor fit"):
+        fit_lens_to_board(MODEL, views, GUESS)
 
 
 def test_a_pinhole_stays_one():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tofcapture import poses
-from tofcapture.camera import Camera
+from tofcapture.camera import Camera, lens_coefficients
 from tofcapture.errors import ConfigError
 from tofcapture.files.hdf import stereo_table, tof_from, tof_table
 from tofcapture.frames import StereoInfo, TofInfo
@@ -21,6 +22,11 @@ from tofcapture.rig import Rig, dumps_rig, loads_rig
 
 PLAIN = Camera(120, 90, 95.3, 100.4, 58.4, 50.7)
 LENS = replace(PLAIN, distortion=(-0.25, 0.08, 0.001, -0.0015, 0.0))
+# An Azure Kinect's depth camera, narrow field of view, as its factory file has it.
+KINECT = Camera(
+    640, 576, 503.9276, 503.9787, 332.0643, 325.8806,
+    (3.130577, 2.324939, 8.1e-05, -5.1e-05, 0.130416, 3.458652, 3.350115, 0.662942),
+)  # fmt: skip
 STEREO = Camera(320, 256, 220.0, 220.0, 159.5, 127.5)
 
 
@@ -30,13 +36,39 @@ def pixels_of(camera):
     return np.stack([u, v], axis=-1)
 
 
-def test_project_and_rays_are_opencvs():
-    """The same numbers as cv2.projectPoints and cv2.undistortPoints."""
+@pytest.mark.parametrize("camera", [LENS, KINECT, replace(LENS, distortion=(0.3, 0.1, 0.02, 0.5, 0.2, 0.01))])
+def test_project_and_rays_are_opencvs(camera):
+    """The same numbers as cv2.projectPoints over the whole image, polynomial and rational; rays come back to 1e-9 px."""
     cv2 = pytest.importorskip("cv2")
-    K = np.array([[LENS.fx, 0, LENS.cx], [0, LENS.fy, LENS.cy], [0, 0, 1]])
-    points = np.random.default_rng(0).uniform([-0.3, -0.2, 0.6], [0.3, 0.2, 1.0], (50, 3))
-    theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(LENS.distortion))[0][:, 0]
-    np.testing.assert_allclose(LENS.project(points)[0], theirs, atol=1e-9)
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    points = (0.7 * camera.rays[::9, ::9]).reshape(-1, 3)
+    theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(camera.distortion))[0][:, 0]
+    np.testing.assert_allclose(camera.project(points)[0], theirs, atol=1e-9)
+    np.testing.assert_allclose(theirs, pixels_of(camera)[::9, ::9].reshape(-1, 2), atol=1e-9)
+
+
+def test_coefficients_are_told_apart_by_their_number():
+    """OpenCV's 4, 5, 8, 12 and 14, and the six k1 to k6 of a rational model; what the model lacks is refused."""
+    four, eight = (-0.2, 0.05, 0.001, 0.002), KINECT.distortion
+    assert lens_coefficients(four) == lens_coefficients((*four, 0.0, 0.0, 0.0, 0.0)) == (*four, 0.0)
+    assert lens_coefficients((1, 2, 3, 4, 5, 6)) == (1, 2, 0, 0, 3, 4, 5, 6)
+    assert lens_coefficients((*eight, *(0.0,) * 6)) == eight
+    with pytest.raises(ConfigError, match="thin-prism"):
+        lens_coefficients((*eight, 0.01, 0.0, 0.0, 0.0))
+    with pytest.raises(ConfigError, match="k1 to k6"):
+        lens_coefficients((0.1,) * 7)
+
+
+@given(st.lists(st.floats(-1.5, 4), min_size=6, max_size=6))
+@settings(max_examples=30)
+def test_every_rational_lens_is_inverted_or_refused(k):
+    """Also one whose denominator vanishes inside the image: a ray that is given projects to its pixel."""
+    try:
+        camera = replace(PLAIN, distortion=tuple(k))
+        rays = camera.rays
+    except ConfigError:
+        return
+    np.testing.assert_allclose(camera.project(rays)[0], pixels_of(camera), atol=1e-5)
 
 
 @given(st.floats(-0.15, 0.2), st.floats(0.0, 0.1), st.floats(-0.003, 0.003), st.floats(-0.003, 0.003))
@@ -60,7 +92,7 @@ def test_a_folding_lens_is_refused_and_folded_points_have_no_pixel():
         replace(PLAIN, distortion=(-0.9, 0.0, 0.0, 0.0, 0.0)).rays  # noqa: B018
     barrel = replace(PLAIN, distortion=(-0.15, 0.0, 0.0, 0.0, 0.0))
     assert np.isnan(barrel.project(np.array([[4.0, 0.0, 1.0]]))[0]).all()
-    with pytest.raises(ConfigError, match="k1, k2, p1, p2, k3"):
+    with pytest.raises(ConfigError, match="k1, k2, p1, p2"):
         replace(PLAIN, distortion=(0.1, 0.2))
 
 
@@ -71,8 +103,13 @@ def test_no_distortion_leaves_files_as_they_were():
     assert "distortion" not in tof_table(info)["camera"]
     bent = tof_from(tof_table(replace(info, camera=LENS)), "test")
     assert bent.camera == LENS
-    rig = Rig(LENS, STEREO, np.eye(4), np.eye(4))
-    assert loads_rig(dumps_rig(rig)).tof == LENS
+    for camera in (LENS, KINECT):
+        rig = Rig(camera, STEREO, np.eye(4), np.eye(4))
+        assert loads_rig(dumps_rig(rig)).tof == camera
+    named = re.sub(r"distortion = \[[^]]*\]", "distortion = {k1 = 1.5, k4 = 1.6, k5 = 0.1}", dumps_rig(rig))
+    assert loads_rig(named).tof.distortion == (1.5, 0, 0, 0, 0, 1.6, 0.1, 0)
+    with pytest.raises(ConfigError, match="k7"):
+        loads_rig(named.replace("k5", "k7"))
     assert "distortion" not in stereo_table(StereoInfo("m", "s", STEREO))["camera"]
     with pytest.raises(ConfigError, match="rectified"):
         StereoInfo("m", "s", replace(STEREO, distortion=LENS.distortion))

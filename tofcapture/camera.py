@@ -1,7 +1,8 @@
 """Cameras: intrinsics and lens, project and unproject, depth and radial.
 
-A lens is OpenCV's model: (X, Y, Z) has x = X/Z, y = Y/Z, r^2 = x^2 + y^2 and is seen at ``x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) +
-2 p1 x y + p2 (r^2 + 2 x^2)``, ``y' = y (...) + p1 (r^2 + 2 y^2) + 2 p2 x y``, ``u = fx x' + cx``, ``v = fy y' + cy``.
+A lens is OpenCV's rational model. (X, Y, Z) has x = X/Z, y = Y/Z, r^2 = x^2 + y^2 and
+``g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)``. It is seen at ``x' = x g + 2 p1 x y + p2 (r^2 + 2 x^2)``,
+``y' = y g + p1 (r^2 + 2 y^2) + 2 p2 x y``, ``u = fx x' + cx``, ``v = fy y' + cy``.
 Camera frames have x right, y down, z forward. Pixel centres are integers, so the image spans
 ``[-0.5, W - 0.5] x [-0.5, H - 0.5]``. ``depth`` is z, ``radial`` is the distance along the ray; both in metres.
 """
@@ -13,22 +14,60 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError
 
 Float64 = NDArray[np.float64]
+Coefficients = NDArray[np.floating] | Sequence[float]
 
+LENS_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""The lens's coefficients in OpenCV's order; the last three belong to the rational model."""
 _NEWTON_STEPS = 30
 _INVERTED = 1e-9  # of an image coordinate at z = 1
 
 
-def distorted(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> Float64:
-    """Distort coordinates (..., 2) at z = 1 by OpenCV's k1, k2, p1, p2, k3."""
-    k1, k2, p1, p2, k3 = coefficients
+def lens_coefficients(given: Sequence[float]) -> tuple[float, ...]:
+    """Bring a lens's coefficients into OpenCV's order: none, 5 (k1, k2, p1, p2, k3), or 8 with k4, k5, k6.
+
+    ``given`` has 0, 4, 5 or 8 of OpenCV's list, 12 or 14 whose further terms are zero, or the six k1 to k6 of a
+    rational model without p1 and p2. Raises :class:`ConfigError` for any other.
+    """
+    c = tuple(float(k) for k in given)
+    if len(c) not in {0, 4, 5, 6, 8, 12, 14} or not np.isfinite(c).all():
+        raise ConfigError(
+            f"camera: expected distortion k1, k2, p1, p2[, k3[, k4, k5, k6]], or k1 to k6, got {list(c)}",
+            hint="OpenCV's order; leave it out for images without distortion",
+        )
+    if any(c[8:]):
+        raise ConfigError(
+            f"camera: expected a lens of at most 8 coefficients, got thin-prism or tilt terms {list(c[8:])}",
+            hint="fit the lens with OpenCV's CALIB_RATIONAL_MODEL alone",
+        )
+    c = (*c[:2], 0.0, 0.0, *c[2:]) if len(c) == 6 else (*c, *(0.0,) * 8)[:8]
+    return c if any(c[5:]) else c[:5] if any(c) else ()
+
+
+def _radial(r2: Float64, coefficients: Coefficients) -> tuple[Float64, Float64, Float64]:
+    """Compute the radial factor, twice its derivative by r^2, and its denominator."""
+    k1, k2, _, _, k3, *below = coefficients
+    above, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2 * k2 + 3 * r2 * k3)
+    if not below:
+        return above, 2 * slope, np.ones_like(r2)
+    k4, k5, k6 = below
+    under = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        factor = above / under
+        return factor, 2 * (slope - factor * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / under, under
+
+
+def distorted(xy: Float64, coefficients: Coefficients) -> Float64:
+    """Distort coordinates (..., 2) at z = 1 by 5 or 8 coefficients of :data:`LENS_NAMES`."""
+    p1, p2 = coefficients[2:4]
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial = _radial(r2, coefficients)[0]
     return np.stack(
         [
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
@@ -38,19 +77,18 @@ def distorted(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float])
     )
 
 
-def distortion_jacobian(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> Float64:
+def distortion_jacobian(xy: Float64, coefficients: Coefficients) -> Float64:
     """Compute the derivative (..., 2, 2) of :func:`distorted`."""
-    k1, k2, p1, p2, k3 = coefficients
+    p1, p2 = coefficients[2:4]
     x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
+    radial, slope, _ = _radial(x * x + y * y, coefficients)
     xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
     yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
     both = x * y * slope + 2 * p1 * x + 2 * p2 * y
     return np.stack([np.stack([xx, both], axis=-1), np.stack([both, yy], axis=-1)], axis=-2)
 
 
-def undistorted(goal: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> Float64:
+def undistorted(goal: Float64, coefficients: Coefficients) -> Float64:
     """Invert :func:`distorted` by Newton's method, to 1e-9; NaN stays NaN.
 
     Raises :class:`ConfigError` when the lens folds before it reaches a coordinate: it was fitted on a smaller part of
@@ -80,11 +118,12 @@ def undistorted(goal: Float64, coefficients: NDArray[np.floating] | Sequence[flo
     return xy
 
 
-def _folds(xy: Float64, coefficients: NDArray[np.floating] | Sequence[float]) -> bool:
+def _folds(xy: Float64, coefficients: Coefficients) -> bool:
     """Tell whether the image turns over anywhere on the straight way from the axis to the coordinates."""
     for share in (0.25, 0.5, 0.75, 1.0):
         J = distortion_jacobian(share * xy, coefficients)
-        if (J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0] <= 0).any():
+        under = _radial(np.square(share * xy).sum(axis=-1), coefficients)[2]
+        if (under <= 0).any() or (J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0] <= 0).any():
             return True
     return False
 
@@ -99,7 +138,7 @@ class Camera:
     fy: float
     cx: float  #: Principal point in pixels, pixel centres at integers.
     cy: float
-    #: OpenCV's k1, k2, p1, p2, k3; empty for a pinhole or a rectified image.
+    #: As :func:`lens_coefficients` returns them; empty for a pinhole or a rectified image.
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -107,14 +146,7 @@ class Camera:
             raise ConfigError(f"camera: expected a positive image size, got {self.width} x {self.height}")
         if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
             raise ConfigError(f"camera: expected positive focal lengths, got fx {self.fx}, fy {self.fy}")
-        object.__setattr__(self, "distortion", tuple(float(k) for k in self.distortion))
-        if len(self.distortion) not in {0, 5} or not np.isfinite(self.distortion).all():
-            raise ConfigError(
-                f"camera: expected distortion k1, k2, p1, p2, k3 or none, got {list(self.distortion)}",
-                hint="append zeros to four coefficients; OpenCV's models of eight and more are not known",
-            )
-        if not any(self.distortion):
-            object.__setattr__(self, "distortion", ())
+        object.__setattr__(self, "distortion", lens_coefficients(self.distortion))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -149,9 +181,12 @@ class Camera:
         """Square of the radius at z = 1 at which the lens folds: nothing beyond is in the image."""
         if not self.distortion:
             return np.inf
-        k1, k2, _, _, k3 = self.distortion
-        # In 1 / r^2 the polynomial keeps its degree however small the coefficients are.
-        roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+        k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, 0.0, 0.0, 0.0)[:8]
+        above, under = Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])  # of r^2
+        slope = above.deriv() * under - above * under.deriv()
+        # In 1 / r^2 a polynomial keeps its degree however small the coefficients are.
+        turns = [np.roots(p.coef) for p in (above * under + Polynomial([0, 2]) * slope, under)]
+        roots = np.concatenate(turns)
         real = roots[np.isreal(roots) & (roots.real > 1e-9)].real
         return float(1 / real.max()) if len(real) else np.inf
 

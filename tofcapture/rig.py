@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.camera import Camera
+from tofcapture.camera import LENS_NAMES, Camera
 from tofcapture.channels import SPEED_OF_LIGHT, Reach, parse_reach
 from tofcapture.errors import ConfigError
 from tofcapture.poses import Float64, check_transform, invert
@@ -175,8 +175,14 @@ def camera_from(table: Mapping[str, Any], where: str) -> Camera:
     if missing:
         raise ConfigError(f"{where}: missing {', '.join(sorted(missing))}")
     fx, fy, cx, cy = (float(table[k]) for k in ("fx", "fy", "cx", "cy"))
-    distortion = tuple(float(k) for k in table.get("distortion", ()))
-    return Camera(int(table["width"]), int(table["height"]), fx, fy, cx, cy, distortion)
+    lens = table.get("distortion", ())
+    if isinstance(lens, Mapping):
+        if unknown := lens.keys() - set(LENS_NAMES):
+            raise ConfigError(
+                f"{where}: distortion has {', '.join(LENS_NAMES)}, got {', '.join(sorted(unknown))}"
+            )
+        lens = [lens.get(k, 0.0) for k in LENS_NAMES]
+    return Camera(int(table["width"]), int(table["height"]), fx, fy, cx, cy, tuple(lens))
 
 
 def camera_table(camera: Camera) -> dict[str, Any]:

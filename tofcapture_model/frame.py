@@ -27,7 +27,7 @@ class Frame(NamedTuple):
     )
     cues: Tensor  #: (B, 4, H, W) depth errors that physics expects, m: geometry.multipath
     modulation: Tensor  #: (B, 2) lowest and highest modulation frequency, Hz
-    intrinsics: Tensor  #: (B, 4 or 9) of the (H, W) grid, px; see geometry.maps
+    intrinsics: Tensor  #: (B, 4 or 12) of the (H, W) grid, px; see geometry.maps
     demodulation: Tensor  #: (B, 4, K) weights that turn taps into phasor
 
 

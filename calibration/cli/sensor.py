@@ -84,10 +84,19 @@ def add_recording(parser: argparse.ArgumentParser, *, board: bool) -> None:
 def configure_lens(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add_recording(parser, board=True)
+    parser.add_argument(
+        "--factory",
+        type=Path,
+        metavar="FILE",
+        help="take the lens from the maker's calibration file (JSON, YAML)",
+    )
+    parser.add_argument("--camera", metavar="NAME", help="part of that file, where it holds several cameras")
 
 
 def run_lens(args: argparse.Namespace) -> Outcome:
-    """Fit the lens, write it into ``rig.toml`` and ``lens.json``."""
+    """Fit the lens, or read the maker's; write it into ``rig.toml`` and ``lens.json``."""
+    if args.factory:
+        return _factory_lens(args)
     from calibration.board.fit import Model
     from calibration.board.geometry import load_board
     from calibration.lens import fit_lens
@@ -106,6 +115,23 @@ def run_lens(args: argparse.Namespace) -> Outcome:
     fit, refused = fit_lens(Model(board), look, rig.tof)
     data = {**lens_report(fit, rig), "refused": refused}
     return saved(args, "lens.json", data, replace(rig, tof=fit.camera), lens_table(data))
+
+
+def _factory_lens(args: argparse.Namespace) -> Outcome:
+    from calibration.factory import factory_camera
+    from calibration.lens import NAMES, lens_values
+
+    rig = believed_rig(args.recording)
+    camera = factory_camera(args.factory, (rig.tof.width, rig.tof.height), args.camera)
+    pairs = zip(NAMES, lens_values(camera), lens_values(rig.tof), strict=True)
+    lens = {n: {"value": float(v), "before": float(b)} for n, v, b in pairs}
+    rows = [(n, f"{v['value']:.5g}", f"{v['before']:.5g}") for n, v in lens.items() if any(v.values())]
+    data = {"format": "tofcapture-lens-calibration", "version": 1, "source": args.factory.name, "lens": lens}
+    text = (
+        kit.table(("", "value", "before"), rows, "  ")
+        + "\nlook: run tofcapture align again: it stood on the lens before"
+    )
+    return saved(args, "lens.json", data, replace(rig, tof=camera), text)
 
 
 def board_seen(view: View, camera: Camera, board: Board) -> BoardSeen:
@@ -151,7 +177,7 @@ def lens_report(fit: BoardLens, rig: Rig) -> dict[str, Any]:
 def lens_table(data: dict[str, Any]) -> str:
     """Lay a report out for a person."""
     lens = data["lens"]
-    held = data["model"] == "pinhole" and any(lens[k]["value"] for k in ("k1", "k2", "p1", "p2", "k3"))
+    held = data["model"] == "pinhole" and any(lens[k]["value"] for k in lens if k[0] in "kp")
     model = "distortion as before" if held else data["model"]
     rows = [
         (name, f"{v['value']:.5g}", f"{v['sigma']:.2g}", f"{v['before']:.5g}")

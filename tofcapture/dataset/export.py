@@ -229,8 +229,8 @@ def _calibration(camera: Camera) -> dict[str, Any]:
         "frame_id": "tof",
         "width": camera.width,
         "height": camera.height,
-        "distortion_model": "plumb_bob",
-        "D": list(camera.distortion) or [0.0] * 5,  # both have k1, k2, p1, p2, k3
+        "distortion_model": "rational_polynomial" if len(camera.distortion) > 5 else "plumb_bob",
+        "D": list(camera.distortion) or [0.0] * 5,  # OpenCV's order, as the camera has it
         "K": K,
         "R": np.eye(3).ravel().tolist(),
         "P": [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0],

@@ -1,10 +1,10 @@
 """Depth, rays and normals on the image grid, differentiable.
 
-Depth is z in metres, normals are unit and face the camera, images are (B, C, H, W), intrinsics (B, 4 or 9).
+Depth is z in metres, normals are unit and face the camera, images are (B, C, H, W), intrinsics (B, 4 or 12).
 All functions keep the dtype they are given.
 
-Intrinsics are fx, fy, cx, cy in pixels, and with a lens OpenCV's k1, k2, p1, p2, k3 behind them. Networks see images as the sensor
-took them; nothing is rectified.
+Intrinsics are fx, fy, cx, cy in pixels, and with a lens OpenCV's k1, k2, p1, p2, k3, k4, k5, k6 behind them. Networks see images as
+the sensor took them; nothing is rectified.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ from tofcapture.errors import ConfigError
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.frame import Frame
 
-PINHOLE, LENS = 4, 9
+PINHOLE, LENS = 4, 12
 _NEWTON_STEPS = 8  # four do for most lenses; one that nearly folds would take many more: refused
 _INVERTED = 1e-4  # of a ray's x and y at z = 1
 
 
 def intrinsics_of(camera: Camera) -> Tensor:
-    """Return (4,) float32 of a pinhole, (9,) of a camera with a lens."""
-    return torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+    """Return (4,) float32 of a pinhole, (12,) of a camera with a lens."""
+    found = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+    return with_lens(found) if camera.distortion else found
 
 
 def expect_usable(camera: Camera) -> None:
@@ -49,24 +50,24 @@ def expect_usable(camera: Camera) -> None:
 
 
 def with_lens(intrinsics: Tensor) -> Tensor:
-    """Add a lens that does nothing, so that cameras with and without one make a batch: (..., 9)."""
+    """Add a lens that does nothing, so that cameras with and without one make a batch: (..., 12)."""
     return F.pad(intrinsics, (0, LENS - intrinsics.shape[-1]))
 
 
 def scale_intrinsics(intrinsics: Tensor, s: int) -> Tensor:
-    """Scale intrinsics (B, 4 or 9) to ``s`` times the resolution: ``f' = s f``, ``c' = s (c + 0.5) - 0.5``."""
+    """Scale intrinsics (B, 4 or 12) to ``s`` times the resolution: ``f' = s f``, ``c' = s (c + 0.5) - 0.5``."""
     f, c, lens = intrinsics[:, :2], intrinsics[:, 2:PINHOLE], intrinsics[:, PINHOLE:]
     return torch.cat([f * s, (c + 0.5) * s - 0.5, lens], dim=1)
 
 
 def thin_intrinsics(intrinsics: Tensor, step: int) -> Tensor:
-    """Take every ``step``-th pixel, from pixel ``step // 2`` on; intrinsics (B, 4 or 9)."""
+    """Take every ``step``-th pixel, from pixel ``step // 2`` on; intrinsics (B, 4 or 12)."""
     f, c, lens = intrinsics[:, :2], intrinsics[:, 2:PINHOLE], intrinsics[:, PINHOLE:]
     return torch.cat([f / step, (c - step // 2) / step, lens], dim=1)
 
 
 def cut_intrinsics(intrinsics: Tensor, top: int, left: int) -> Tensor:
-    """Cut a window at (top, left) out of the image; intrinsics (..., 4 or 9)."""
+    """Cut a window at (top, left) out of the image; intrinsics (..., 4 or 12)."""
     moved = intrinsics.clone()
     moved[..., 2] -= left
     moved[..., 3] -= top
@@ -74,7 +75,7 @@ def cut_intrinsics(intrinsics: Tensor, top: int, left: int) -> Tensor:
 
 
 def mirror_intrinsics(intrinsics: Tensor, axis: int, size: int) -> Tensor:
-    """Mirror images of ``size`` pixels along ``axis``: -1 left and right, -2 up and down; intrinsics (..., 4 or 9)."""
+    """Mirror images of ``size`` pixels along ``axis``: -1 left and right, -2 up and down; intrinsics (..., 4 or 12)."""
     flipped, component = intrinsics.clone(), -1 - axis
     flipped[..., 2 + component] = size - 1 - flipped[..., 2 + component]
     if intrinsics.shape[-1] == LENS:
@@ -107,9 +108,11 @@ def pixel_slopes(intrinsics: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tens
 
 def _distorted(intrinsics: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Distort x and y; with the derivative, which is symmetric: of x along x, of either along the other, of y along y."""
-    k1, k2, p1, p2, k3 = (intrinsics[:, i, None, None] for i in range(PINHOLE, LENS))
+    k1, k2, p1, p2, k3, k4, k5, k6 = (intrinsics[:, i, None, None] for i in range(PINHOLE, LENS))
     r2 = x * x + y * y
-    radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
+    under = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / under
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / under
     return (
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
         y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,

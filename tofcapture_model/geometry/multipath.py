@@ -39,7 +39,7 @@ def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: 
     depth, valid, gap
         (B, 1, H, W) decoded depth and its weight; range of the low minus range of the high frequency; metres.
     intrinsics, hz
-        (B, 4 or 9), and the high modulation frequency.
+        (B, 4 or 12), and the high modulation frequency.
 
     Returns
     -------

@@ -16,7 +16,7 @@ from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Config, dumps_config, loads_config
 from tofcapture_model.frame import Estimate, Frame
-from tofcapture_model.geometry.maps import LENS, with_lens
+from tofcapture_model.geometry.maps import LENS, PINHOLE, with_lens
 from tofcapture_model.networks.checkpoint import find_model, load_model
 
 OUTPUTS = ("depth_2x", "normals_2x", "error_2x")
@@ -52,7 +52,9 @@ def example(batch: int, size: tuple[int, int] = SIZE, seed: int = 0) -> Frame:
         return torch.randn(batch, channels, h, w, generator=g)
 
     ramp = torch.linspace(0, 0.2, w).expand(batch, 1, h, w)
-    camera = torch.tensor([0.8 * w, 0.8 * w, (w - 1) / 2, (h - 1) / 2, -0.15, 0.03, 1e-3, -1e-3, 0.0])
+    camera = torch.tensor(
+        [0.8 * w, 0.8 * w, (w - 1) / 2, (h - 1) / 2, -0.15, 0.03, 1e-3, -1e-3, 0.0, 0.01, 0.0, 0.0]
+    )
     return Frame(
         raw=0.3 + 0.05 * noise(8),
         phasor=0.1 * noise(4),
@@ -232,13 +234,13 @@ def ask_onnx(session: Any, frame: Frame) -> list[NDArray[np.float32]]:
     Raises
     ------
     ConfigError
-        The camera has a lens, and the export was made before they took one.
+        The camera has a lens, and the export was made before they took such ones.
     """
     wanted = {i.name: i.shape for i in session.get_inputs()}
     numbers = wanted.get("intrinsics", (0, LENS))[1]
-    if frame.intrinsics.shape[1] > numbers:
+    if frame.intrinsics[:, numbers:].any():
         raise ConfigError(
-            "expected an export for cameras with lens distortion, got one that takes none",
+            f"expected an export for cameras with such a lens, got one that takes {numbers - PINHOLE} of its coefficients",
             hint="run tofcapture export again: it takes any lens now",
         )
     asked = frame._replace(intrinsics=with_lens(frame.intrinsics)[:, :numbers])

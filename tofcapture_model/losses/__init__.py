@@ -103,7 +103,7 @@ class Objective(NamedTuple):
 def objective(
     weights: Losses, stage: str, estimate: Estimate, target: Target, intrinsics: Tensor
 ) -> Objective:
-    """Weigh the losses that take part in a stage; ``intrinsics`` (B, 4 or 9) are of the estimate's grid.
+    """Weigh the losses that take part in a stage; ``intrinsics`` (B, 4 or 12) are of the estimate's grid.
 
     ``depth``: eq. 1, eq. 2 and the error map on the initial depth. ``normal``: eq. 3 on the initial normals. ``refine``: eq. 1
     and eq. 3 on the refined maps. ``joint``: everything on the refined maps.
