@@ -100,18 +100,13 @@ def test_brute_force_in_torch_is_brute_force():
         check(neighbours, pair(surface, "holes", (19, 23)))
 
 
-@pytest.mark.parametrize(
-    "share", ["some", pytest.param("all", marks=[pytest.mark.slow, pytest.mark.timeout(3600)])]
-)
-def test_the_interpreted_kernel_finds_the_nearest(share):
-    """The search for GPUs by Triton's interpreter, a program at a time; Triton has to be told before it is imported."""
+def test_the_interpreted_kernel_finds_the_nearest():
+    """The search for GPUs by Triton's interpreter; Triton has to be told before it is imported."""
     pytest.importorskip("triton", reason="Triton comes with PyTorch's wheels for GPUs")
     env = {**os.environ, "TRITON_INTERPRET": "1"}
-    done = subprocess.run(
-        [sys.executable, __file__, share], env=env, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([sys.executable, __file__], env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.split() == ["checked", share]
+    assert done.stdout.split("\n")[:-1] == list(SURFACES)
 
 
 @pytest.mark.gpu
@@ -235,10 +230,12 @@ def test_lengths_scale_squared():
 
 
 if __name__ == "__main__":
+    from triton.language import standard
+
     from tofcapture_model.losses.chamfer import tiles
 
-    few = sys.argv[1] == "some"
-    for each in ("stepped", "apart") if few else SURFACES:
-        clouds = pair(each, "sparse" if each == "apart" else "holes", (9, 17) if few else (13, 21))
-        check(tiles, clouds, shifts=SHIFTS[::4] if few else SHIFTS)
-    print("checked", sys.argv[1])
+    # Where draws may fall to any index the interpreter compares one by one, for minutes; the leftmost is one of them.
+    standard._argmin_combine_tie_break_fast = standard._argmin_combine_tie_break_left
+    for each in SURFACES:
+        check(tiles, pair(each, "sparse" if each == "apart" else "holes", (9, 17)), shifts=SHIFTS[::3])
+        print(each, flush=True)
