@@ -12,6 +12,7 @@ from calibration.evidence import evidence_of, write_json
 from calibration.registration.gate import backend_named
 from calibration.registration.pairs import Pair, calibration_views, load_pair
 from tofcapture.errors import DataError
+from tofcapture.files.disk import check_writable
 from tofcapture.files.seal import write_text
 from tofcapture.rig import Rig, dumps_rig
 
@@ -22,6 +23,7 @@ def align(
     initial: Rig | None = None,
     progress: Progress = lambda _stage, _done, _total: None,
     method: str = "averaged",
+    out: str | Path | None = None,
 ) -> tuple[Rig, dict[str, Any]]:
     """Align the cameras of a recording by averaged ICP; write ``evidence.json``, then ``rig.toml``.
 
@@ -41,6 +43,8 @@ def align(
     method
         ``averaged`` as in the paper, ``weighted`` by each pair's information, or ``joint``: one robust problem over all
         accepted views that starts at the average and finds the range errors too.
+    out
+        Folder of ``rig.toml`` and ``evidence.json``; by default the recording.
 
     Returns
     -------
@@ -54,13 +58,15 @@ def align(
     DataError
         No calibration views, unreadable ones, views of different cameras, in millimetres, mirrored or blind.
     ConfigError
-        Unknown backend, or its library is missing; an initial guess in millimetres or swapped.
+        Unknown backend, or its library is missing; an initial guess in millimetres or swapped; ``out`` cannot be written.
     QualityError
         Fewer than three pairs pass the gate, with the likely cause; nothing is written then.
     """
     backend_named(backend)
     method_named(method)
     recording = Path(recording)
+    out = recording if out is None else Path(out)
+    check_writable(out, "name a folder that can be written: --out")
     pairs = _load(recording, progress)
     start = pairs[0].rig if initial is None else initial
     check_start(start.T_tof_stereo)
@@ -70,8 +76,8 @@ def align(
         raise explained(err, recording, pairs, backend, start.T_tof_stereo) from None
     rig, found = apply_method(method, recording, pairs, solution, start)
     evidence = evidence_of(pairs, solution, backend, start.T_tof_stereo, rig.T_tof_stereo, found)
-    write_json(recording / "evidence.json", evidence)
-    write_text(recording / "rig.toml", dumps_rig(rig))
+    write_json(out / "evidence.json", evidence)
+    write_text(out / "rig.toml", dumps_rig(rig))
     return rig, evidence
 
 

@@ -19,8 +19,8 @@ from tests.test_daemon_api import STATION
 from tofcapture.cli import main
 from tofcapture.colours import GREY
 from tofcapture.errors import BusyError, ConfigError, DataError, UsageError
+from tofcapture.files.disk import is_full
 from tofcapture.record.daemon import settings, store, worker
-from tofcapture.record.resources import is_full
 
 cv2 = pytest.importorskip("cv2")
 

@@ -8,7 +8,8 @@
     ├── DeviceError          4             a device is missing, silent or refuses
     │   └── MotionRefused    4             the arm must not or cannot go there
     ├── DataError            5             a file is missing, damaged, foreign, or says something impossible
-    │   └── FormatError      5             a file's layout is not the one its version promises
+    │   ├── FormatError      5             a file's layout is not the one its version promises
+    │   └── UnreadableError  5             a file cannot be read just now (lock, permission, disk); that is no damage
     ├── QualityError         6             a gate refused a result (registration, coverage, ground truth)
     └── BusyError            7             someone else holds the recording or the station
 
@@ -61,6 +62,10 @@ class FormatError(DataError):
     """A file's layout is not the one its version promises."""
 
 
+class UnreadableError(DataError):
+    """A file cannot be read just now: a lock, a permission, a disk's error. That is no damage."""
+
+
 class QualityError(TofError):
     """A gate refused a result."""
 
@@ -71,3 +76,7 @@ class BusyError(TofError):
     """Someone else holds the recording or the station."""
 
     exit_code = 7
+
+
+class PassedOver(UserWarning):
+    """A file among the views of a recording is none of them; the message names it and says why."""

@@ -62,7 +62,21 @@ def _njit(function: Callable[..., Any]) -> Any:
         raise ConfigError(
             f"numba is needed here and does not load: {err}", hint="pip install 'tofcapture[capture]'"
         ) from err
-    return njit(cache=True, error_model="numpy", nogil=True)(function)
+    try:
+        return njit(cache=True, error_model="numpy", nogil=True)(function)
+    except RuntimeError:  # no folder where machine code could be kept: it is made anew by every process
+        return njit(error_model="numpy", nogil=True)(function)
+
+
+def keeps_kernels() -> bool:
+    """Tell whether there is a folder where machine code can be kept."""
+    from numba import njit
+
+    try:
+        njit(cache=True)(_njit)
+    except RuntimeError:
+        return False
+    return True
 
 
 def _preload_libusb() -> None:

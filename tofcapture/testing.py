@@ -21,17 +21,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tofcapture.devices.contract import check_burst, check_points, check_state, check_tof_info
 from tofcapture.devices.registry import lacking
-from tofcapture.errors import MotionRefused, TofError
-from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth
-from tofcapture.poses import Float64, check_transform
+from tofcapture.errors import ConfigError, MotionRefused, TofError
+from tofcapture.frames import ArmInfo, ArmState, StereoInfo, TofInfo, Truth
+from tofcapture.poses import Float64
 
 Make = Callable[[], Any]
 Prepare = Callable[[Any], None]
 
 _NEAR = np.radians(0.1)  # rad; a settled arm is this close to its goal
 _NUDGE = 0.02  # rad
-_FAR = 20.0  # m; points beyond are millimetres
 _IO = ("socket.connect", "socket.bind", "subprocess.Popen", "os.posix_spawn", "os.fork", "pty.spawn")
 
 
@@ -77,6 +77,7 @@ def check_tof(make: Make, prepare: Prepare = lambda _: None, frames: int = 2) ->
     """Put a ToF camera through the contract, with bursts of ``frames`` frames."""
     camera = _made(make, "tof")
     info = _check_describe(camera, TofInfo)
+    _keeps(check_tof_info, info)
     _only_named_errors(
         lambda: camera.capture(1), "capture() of a camera that is not open raises TofErrors only"
     )
@@ -108,7 +109,7 @@ def check_stereo(make: Make, prepare: Prepare = lambda _: None) -> None:
             _require(opened is camera, "__enter__ returns the device")
             for _ in range(2):
                 frame = camera.capture()
-                _check_points(frame, info)
+                _check_frame(frame, info)
                 _require(last is None or frame.time_ns > last, "a later point map is later")
                 last = frame.time_ns
         camera = make()
@@ -201,12 +202,7 @@ def _check_describe(device: Any, kind: type) -> Any:
 def _check_state(arm: Any) -> ArmState:
     first, second = arm.state(), arm.state()
     for state in (first, second):
-        _require(isinstance(state, ArmState), "state() returns an ArmState", state)
-        _require(
-            np.shape(state.joints) == (6,) and np.isfinite(state.joints).all(), "joints are 6 finite angles"
-        )
-        check_transform(state.T_base_flange)
-        _require(isinstance(state.time_ns, int), "time_ns is a whole number", state.time_ns)
+        _keeps(check_state, state)
     _require(second.time_ns > first.time_ns, "the time of a later state is later")
     checked: ArmState = second
     return checked
@@ -237,28 +233,21 @@ def _check_refusals(arm: Any) -> None:
 
 
 def _check_burst(burst: Any, info: TofInfo, frames: int) -> None:
-    _require(isinstance(burst, TofBurst), "capture() returns a TofBurst", type(burst))
-    shape = (frames, len(info.modulation_hz), *info.camera.shape)
-    _require(burst.raw.shape == shape, f"raw has the shape {shape} that describe() promises", burst.raw.shape)
+    _keeps(check_burst, burst, info)
+    _require(len(burst.raw) == frames, "raw has as many frames as were asked for", len(burst.raw))
     kinds = (np.uint16, np.int16)
     _require(burst.raw.dtype in kinds, "raw is uint16 or int16, as the sensor gave it", burst.raw.dtype)
-    _require(burst.time_ns.dtype == np.int64, "time_ns is int64", burst.time_ns.dtype)
     _require((np.diff(burst.time_ns) > 0).all(), "the times of a burst increase")
-    one_each = burst.celsius.shape == (frames,)
-    _require(one_each, "celsius has one value a frame, NaN for unknown", burst.celsius.shape)
-    _require(repr(burst.info) == repr(info), "the burst carries what describe() says")
 
 
-def _check_points(frame: Any, info: StereoInfo) -> None:
-    _require(isinstance(frame, StereoFrame), "capture() returns a StereoFrame", type(frame))
-    _require(frame.points.dtype == np.float32, "points are float32", frame.points.dtype)
-    measured = np.isfinite(frame.points).all(axis=-1)
-    whole = (np.isfinite(frame.points).any(axis=-1) == measured).all()
-    _require(whole, "a point has three numbers or three NaN")
-    _require(not (frame.points[measured] == 0).all(axis=-1).any(), "zero never means missing: NaN does")
-    depths = frame.points[..., 2][measured]
-    _require(depths.size, "the point map of a scene is not empty")
-    _require((depths > 0).all(), "points lie in front of the camera")
-    median = float(np.median(depths))
-    _require(median < _FAR, "points are in metres", median)
-    _require(repr(frame.info) == repr(info), "the frame carries what describe() says")
+def _check_frame(frame: Any, info: StereoInfo) -> None:
+    _keeps(check_points, frame, info)
+    _require(np.isfinite(frame.points).any(), "the point map of a scene is not empty")
+
+
+def _keeps(check: Callable[..., None], *arguments: Any) -> None:
+    """Hold something against the rules that the recorder applies too."""
+    try:
+        check(*arguments)
+    except ConfigError as err:
+        raise ContractError(f"{err.message} ({err.hint})") from err

@@ -19,6 +19,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recording", type=Path, metavar="RECORDING", help="folder that record --calibration filled"
     )
+    out = "folder of rig.toml and evidence (default: the recording, which must then be writable)"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=out)
     parser.add_argument(
         "--backend",
         default="open3d",
@@ -48,9 +50,10 @@ def _run(args: argparse.Namespace) -> Outcome:
     initial = None if args.initial is None else load_rig(args.initial)
     old = None if args.compare is None else load_old(args.compare)  # before align replaces rig.toml
     with kit.progress() as progress:
-        rig, evidence = align(args.recording, args.backend, initial, progress, args.method)
-        page, absent = _page(args.recording, old, evidence, progress)
-    paths = {"rig": str(args.recording / "rig.toml"), "evidence": str(args.recording / "evidence.json")}
+        out = args.out or args.recording
+        rig, evidence = align(args.recording, args.backend, initial, progress, args.method, out)
+        page, absent = _page(args.recording, out, old, evidence, progress)
+    paths = {"rig": str(out / "rig.toml"), "evidence": str(out / "evidence.json")}
     moved = None if old is None else drift(evidence, old)
     kept = ("backend", "views", "used", "spread", "standard_error", "pairs", "verdict", "checks")
     data = {
@@ -67,16 +70,20 @@ def _run(args: argparse.Namespace) -> Outcome:
 
 
 def _page(
-    recording: Path, old: OldRig | None, evidence: dict[str, Any], progress: Callable[[str, int, int], None]
+    recording: Path,
+    out: Path,
+    old: OldRig | None,
+    evidence: dict[str, Any],
+    progress: Callable[[str, int, int], None],
 ) -> tuple[str | None, str]:
     """Write evidence.html; its path, or None and why there is none: rig and evidence stand without it."""
     from calibration.evidence.page import write_evidence_page
 
     try:
-        return str(write_evidence_page(recording, old, evidence, progress)), ""
+        return str(write_evidence_page(recording, old, evidence, progress, out)), ""
     except ConfigError as err:
         # An older page would speak of an older alignment.
-        (recording / "evidence.html").unlink(missing_ok=True)
+        (out / "evidence.html").unlink(missing_ok=True)
         return None, f"no evidence.html: {err.message}; {err.hint}"
 
 

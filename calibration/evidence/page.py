@@ -78,8 +78,9 @@ def write_evidence_page(
     old: OldRig | None = None,
     evidence: Mapping[str, Any] | None = None,
     progress: Progress = lambda _stage, _done, _total: None,
+    out: Path | None = None,
 ) -> Path:
-    """Write ``RECORDING/evidence.html``.
+    """Write ``evidence.html`` into ``out``, by default the recording.
 
     Residuals are computed anew from the views, at the transform that the evidence states: that of ``evidence.json`` unless it is given.
     ``old`` is an older alignment to compare with. ``progress`` is called with a stage, steps done and steps in all. Same inputs, same
@@ -92,7 +93,7 @@ def write_evidence_page(
     samples = sample_recording(recording, found, progress)
     content = page_content(found, samples, moved, "" if old is None else old.name)
     return write_page(
-        Path(__file__).with_name("evidence.html.j2"), Path(recording) / "evidence.html", content
+        Path(__file__).with_name("evidence.html.j2"), Path(out or recording) / "evidence.html", content
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from calibration.registration.clouds import Cloud, stereo_cloud, surface_points, tof_depth
 from calibration.registration.rims import REPEAT, rim_cloud, stereo_rims, tof_rims
 from tofcapture.errors import DataError
-from tofcapture.files.view import read_view
+from tofcapture.files.view import find_views, read_view
 from tofcapture.frames import View
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig
@@ -35,8 +35,9 @@ class Pair:
 
 def calibration_views(recording: Path) -> list[Path]:
     """Find the sealed board views of a recording, in order; :class:`DataError` when there are none."""
-    folder = Path(recording) / "views" / "calibration"
-    found = sorted(folder.glob("view-*.h5"))
+    recording = Path(recording)
+    folder = recording / "views" / "calibration"
+    found = list(find_views(recording).get(folder.name, ()))
     if not found:
         raise DataError(
             f"{recording}: expected calibration views in {folder}, found none",

@@ -8,19 +8,24 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import io
 import itertools
 import json
 import os
 import re
+import signal
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+import threading
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from tofcapture import __version__
 from tofcapture.cli.kit import Command, Outcome
-from tofcapture.errors import ConfigError, TofError, UsageError
+from tofcapture.errors import ConfigError, PassedOver, TofError, UsageError
 
 GROUP = "tofcapture.commands"
 EXIT_CODES = "exit codes: 0 ok, 1 unexpected, 2 usage, 3 config, 4 device, 5 data, 6 quality gate, 7 busy, 130 interrupted"
@@ -149,14 +154,62 @@ def _run(argv: Sequence[str]) -> Outcome:
     return _load(entries[args.command]).run(args)
 
 
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM came: everything is put away as after Ctrl-C."""
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM end a command as Ctrl-C does; commands that have their own way, as the daemon, replace it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, _: object) -> None:
+        signal.signal(number, signal.SIG_IGN)  # the second one must not break into the putting away
+        raise _Terminated
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _notes_on_one_line() -> Iterator[None]:
+    """Name the files that are passed over as other messages are told."""
+    usual = warnings.showwarning
+
+    def show(message: Any, category: type[Warning], *where: Any, **more: Any) -> None:
+        if issubclass(category, PassedOver):
+            print(f"tofcapture: {message}", file=sys.stderr)
+        else:
+            usual(message, category, *where, **more)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", PassedOver)
+        warnings.showwarning = show
+        yield
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; every expected error becomes at most a few lines on stderr."""
     argv = list(sys.argv[1:] if argv is None else argv)
     as_json = "--json" in argv
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(
+                errors="backslashreplace"
+            )  # a latin-1 terminal shows a Greek folder all the same
     try:
-        outcome = _run(argv)
+        with _notes_on_one_line(), _terminable():
+            outcome = _run(argv)
     except TofError as err:
         return _failed(type(err).__name__, err.message, err.hint, err.exit_code, as_json=as_json)
+    except _Terminated:
+        hint = "run the same command again to go on"
+        return _failed("Terminated", "terminated", hint, 143, as_json=as_json)
     except KeyboardInterrupt:
         hint = "run the same command again to go on"
         return _failed("Interrupted", "interrupted", hint, 130, as_json=as_json)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -44,8 +43,8 @@ def _run_daemon(args: argparse.Namespace) -> Outcome:
 
 
 def _announce(socket: Path, url: str | None) -> None:
-    """Say where the daemon listens; the token is for a person's eyes, not for systemd's log."""
-    if url and "JOURNAL_STREAM" in os.environ:
+    """Say where the daemon listens; the token is for a person's eyes, not for a log."""
+    if url and not sys.stderr.isatty():
         url = f"{url.partition('#')[0]} (tofcapture status --url shows the token)"
     for where in filter(None, (f"unix:{socket}", url)):
         print(f"listening on {where}", file=sys.stderr, flush=True)

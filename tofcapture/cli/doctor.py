@@ -215,6 +215,18 @@ def check_memory() -> Iterator[Finding]:
         yield graded("shared memory", f"{free / 1e6:.0f} MB free", advice)
 
 
+def check_surroundings() -> Iterator[Finding]:
+    """Look at what users without a home or with another locale lack."""
+    from tofcapture.libraries import keeps_kernels
+
+    advice = "set NUMBA_CACHE_DIR to a folder of yours: each command now compiles anew, for up to a minute"
+    kept = keeps_kernels()
+    yield graded("compiled code", "can be kept" if kept else "cannot be kept", "" if kept else advice)
+    names, out = sys.getfilesystemencoding(), sys.stdout.encoding
+    advice = "" if names == "utf-8" else "set LC_ALL=C.UTF-8: names of files beyond ASCII are shown escaped"
+    yield graded("locale", f"file names in {names}, output in {out}", advice)
+
+
 def check_ports(dev: Path = Path("/dev")) -> Iterator[Finding]:
     """Look for serial ports, and whether this user may open them."""
     named = sorted((dev / "serial" / "by-id").glob("*"))
@@ -285,7 +297,13 @@ def _run(args: argparse.Namespace) -> Outcome:
     station = str(station_path(args.station)[0] or "")
     quick: tuple[Examination, ...] = (check_python, check_libraries, check_wheels, check_weights)
     # The disk's speed and the clocks are measured when nothing else runs.
-    alone: tuple[Examination, ...] = (check_clock, check_memory, check_ports, check_daemon)
+    alone: tuple[Examination, ...] = (
+        check_clock,
+        check_memory,
+        check_surroundings,
+        check_ports,
+        check_daemon,
+    )
     with ThreadPoolExecutor(max_workers=len(PROBES)) as pool:
         there = {"station": (station, "open" if args.open else "")}
         probed = list(pool.map(lambda name: probe(name, *there.get(name, ())), PROBES))

@@ -19,11 +19,12 @@ from tofcapture.dataset.card import write_card
 from tofcapture.dataset.sample import SampleConfig, TruthError, pooled_error
 from tofcapture.dataset.scene import WORK, SceneOutcome, SceneTask, build_scene, versions
 from tofcapture.errors import ConfigError, DataError, TofError
+from tofcapture.files.disk import check_writable
 from tofcapture.files.layout import BOARD_SCENE
 from tofcapture.files.manifest import Manifest, SceneEntry, assign_splits, write_manifest
 from tofcapture.files.seal import PARTIAL
 from tofcapture.files.shard import ShardReader
-from tofcapture.files.view import read_depth_view
+from tofcapture.files.view import find_views, read_depth_view
 from tofcapture.pool import RETRIES, Pool
 from tofcapture.rig import Rig, load_rig
 
@@ -122,6 +123,7 @@ def build_dataset(
     index, count = part or (1, 1)
     if not 1 <= index <= count:
         raise ConfigError(f"--part: expected I/N with 1 <= I <= N, got {index}/{count}", hint="--part 2/8")
+    check_writable(out, "name another folder: --out")
     tasks = scene_tasks(recordings, out, rig_path, true_rig=true_rig, config=config)
     mine = [] if finish else tasks[index - 1 :: count]
     outcomes = _run(mine, engine, default_jobs() if jobs is None else jobs, scheduler, progress)
@@ -178,15 +180,13 @@ def find_scenes(recordings: Sequence[Path]) -> dict[str, tuple[Path, tuple[Path,
                 f"{recording}: expected a recording with a folder 'views'",
                 hint="tofcapture record --scene NAME",
             )
-        for scene in sorted(p for p in folder.iterdir() if p.is_dir() and p.name != BOARD_SCENE):
-            if scene.name in found:
+        for scene, views in find_views(recording).items():
+            if scene in found:
                 raise ConfigError(
-                    f"scene {scene.name} is in {found[scene.name][0]} and in {recording}",
-                    hint="rename one of them",
+                    f"scene {scene} is in {found[scene][0]} and in {recording}", hint="rename one of them"
                 )
-            views = tuple(sorted(scene.glob("view-*.h5")))
-            if views:
-                found[scene.name] = (Path(recording), views)
+            if scene != BOARD_SCENE:
+                found[scene] = (Path(recording), views)
     if not found:
         raise DataError(
             f"no scene in {', '.join(map(str, recordings))}",

@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 import tomllib
@@ -23,14 +22,13 @@ from tofcapture.devices import Arm, Device, Operator, StereoDevice, TofCamera
 from tofcapture.devices.kinematics import HOME, MODELS, ArmModel, check_joints, forward
 from tofcapture.devices.registry import ROLES, StationContext, check_keys
 from tofcapture.errors import ConfigError, DataError, DeviceError
-from tofcapture.files.view import check_scene_name, read_view, view_path
+from tofcapture.files.view import check_scene_name, find_views, read_view, view_number, view_path
 from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth, View
 from tofcapture.poses import Float64
 from tofcapture.rig import dumps_rig
 
 ORDERS = ("joints", "file")
 _NEAR = 0.02  # rad; farther from every recorded view, there is nothing to serve
-_NUMBER = re.compile(r"view-(\d+)\.h5")
 
 
 class Replay:
@@ -50,15 +48,13 @@ class Replay:
 
     def scenes(self) -> dict[str, list[int]]:
         """Views of each scene, by number."""
-        found: dict[str, list[int]] = {}
-        for path in sorted((self.recording / "views").glob("*/view-*.h5")):
-            if match := _NUMBER.fullmatch(path.name):
-                found.setdefault(path.parent.name, []).append(int(match[1]))
+        views = find_views(self.recording)
+        found = {scene: [view_number(p) or 0 for p in paths] for scene, paths in views.items()}
         if not found:
             raise ConfigError(
                 f"{self.recording}: expected a recording with views", hint="see [arm] recording"
             )
-        return {scene: sorted(numbers) for scene, numbers in found.items()}
+        return found
 
     def first(self) -> View:
         """Any view: all of a recording's were taken with the same devices."""

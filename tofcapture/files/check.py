@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sqlite3
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
+from tofcapture.errors import TofError
 from tofcapture.files.cache import is_cache, open_cache, verify_cache
 from tofcapture.files.check_file import Problem, check_file, guarded
-from tofcapture.files.hdf import json_attr
+from tofcapture.files.disk import is_there, read_rows
+from tofcapture.files.hdf import json_attr, open_h5
 from tofcapture.files.manifest import SceneEntry, load_manifest, manifest_path, object_of
 from tofcapture.files.seal import digest_path, sha256_of
+from tofcapture.files.view import list_views
 from tofcapture.rig import load_rig
 
 __all__ = ["Problem", "check"]
@@ -27,6 +27,7 @@ Tell = Callable[[Path], None]
 Scenes = Mapping[str, SceneEntry]
 _AGAIN = "run build-dataset again"
 _BESIDE = ("README", "LICENSE", "LICENCE", "CITATION", "CHANGELOG", "NOTICE")
+_SEALED = "SELECT scene, \"index\", sha256 FROM views WHERE state = 'sealed'"
 _OWN = ("manifest.json", "croissant.json", "shards", "simulation", "stats.html", "stats.json")
 
 
@@ -67,7 +68,10 @@ def _check_folder(path: Path, tell: Tell) -> Iterator[Problem]:
 def _check_recording(path: Path, tell: Tell) -> Iterator[Problem]:
     promised, problems = _journal(path)
     yield from problems
-    views = sorted((path / "views").glob("*/view-*.h5"))
+    scenes, others = list_views(path)
+    views = [view for scene in scenes.values() for view in scene]
+    for other, why in others.items():
+        yield Problem(other, "", f"passed over: {why}", "move it out of the recording")
     if not views:
         yield Problem(
             path, "", "expected views, found none", "tofcapture record --scene NAME --out RECORDING"
@@ -97,15 +101,16 @@ def _load_json(path: Path) -> Any:
 def _journal(recording: Path) -> tuple[dict[tuple[str, str], str], list[Problem]]:
     """Digests that the journal promises, by (scene, file name)."""
     path = recording / "journal.sqlite"
-    if not path.exists():
+    if not is_there(path):
         return {}, []
+    again = "move it away: tofcapture record rebuilds it from the sealed views"
     try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
-            rows = db.execute("SELECT scene, \"index\", sha256 FROM views WHERE state = 'sealed'").fetchall()
-    except sqlite3.Error as err:
-        again = "tofcapture record rebuilds it from the sealed views"
-        return {}, [Problem(path, "", f"cannot be read: {err}", again)]
-    return {(scene, f"view-{index:03d}.h5"): sha for scene, index, sha in rows if sha}, []
+        rows = read_rows(path, _SEALED, "a journal", again)
+        return {(scene, f"view-{int(index):03d}.h5"): sha for scene, index, sha in rows if sha}, []
+    except TofError as err:
+        return {}, [Problem(path, "", err.message.removeprefix(f"{path}: "), err.hint)]
+    except (ValueError, TypeError) as err:
+        return {}, [Problem(path, "", f"damaged: {err}", again)]
 
 
 def _check_cache(cache: Path, dataset: Path | None = None) -> Iterator[Problem]:
@@ -139,7 +144,7 @@ def _check_dataset(path: Path, tell: Tell) -> Iterator[Problem]:
 
 
 def _check_entry(dataset: Path, name: str, entry: SceneEntry) -> Iterator[Problem]:
-    with h5py.File(dataset / entry.path, "r") as file:
+    with open_h5(dataset / entry.path) as file:
         scene, views = file.attrs["scene"], file["tof/raw"].shape[0]
     if scene != name:
         yield Problem(manifest_path(dataset), name, f"its shard holds the scene {scene!r}")
@@ -151,7 +156,7 @@ def _duplicates(dataset: Path, scenes: Scenes) -> Iterator[Problem]:
     """Views that are there twice: noise makes a burst's first frame its own."""
     first: dict[str, tuple[str, int]] = {}
     for name, entry in scenes.items():
-        with h5py.File(dataset / entry.path, "r") as file:
+        with open_h5(dataset / entry.path) as file:
             raw = file["tof/raw"]
             prints = [hashlib.sha256(np.asarray(raw[v, 0]).tobytes()).hexdigest() for v in range(len(raw))]
         for view, mark in enumerate(prints):
@@ -170,7 +175,7 @@ def _objects(dataset: Path, name: str, entry: SceneEntry, *, sound: bool) -> set
     note = dataset / "simulation" / f"{name}.json"
     said: list[Any] = []
     if sound:
-        with h5py.File(dataset / entry.path, "r") as file:
+        with open_h5(dataset / entry.path) as file:
             said += json_attr(file, "provenance", dataset / entry.path).get("objects") or []
     if note.is_file():
         said += _load_json(note).get("objects") or []

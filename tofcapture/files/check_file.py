@@ -16,8 +16,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.errors import ConfigError, TofError
-from tofcapture.files.hdf import Array, json_attr, stereo_from, text_attr, tof_from
+from tofcapture.errors import ConfigError, TofError, UnreadableError
+from tofcapture.files.disk import is_there, unreadable
+from tofcapture.files.hdf import Array, json_attr, open_h5, stereo_from, text_attr, tof_from
 from tofcapture.files.layout import LAYOUTS, SHARD, VIEW, Field, Layout, MaskBit
 from tofcapture.files.seal import digest_path, digest_text, sha256_of, stored_digest
 from tofcapture.frames import StereoInfo, TofFlag, TofInfo
@@ -55,6 +56,8 @@ def guarded(path: Path, problems: Callable[[], Iterator[Problem]]) -> list[Probl
         found.append(Problem(path, "", err.message.removeprefix(f"{path}: "), err.hint))
     except Exception as err:
         # Damaged HDF5 raises anything; whatever it is, it is a problem of this file.
+        if passing := unreadable(path, err):
+            return [*found, Problem(path, "", passing.message.removeprefix(f"{path}: "), passing.hint)]
         found.append(Problem(path, "", f"cannot be checked: {type(err).__name__}: {err}", _AGAIN))
     return found
 
@@ -65,11 +68,11 @@ def check_file(path: Path, sha256: str | None = None) -> list[Problem]:
 
 
 def _check_file(path: Path, sha256: str | None) -> Iterator[Problem]:
-    if not path.is_file():
+    if not is_there(path) or not path.is_file():
         yield Problem(path, "", "expected a file, found none", _AGAIN)
         return
     found, stored, beside = sha256_of(path), stored_digest(path), digest_path(path)
-    if stored is None and not h5py.is_hdf5(path):
+    if stored is None and not _signed(path):
         yield Problem(path, "", "expected HDF5: not that, truncated, or damaged", _AGAIN)
         return
     if stored is None:
@@ -86,12 +89,20 @@ def _check_file(path: Path, sha256: str | None) -> Iterator[Problem]:
     if differing:
         return
     try:
-        file = h5py.File(path, "r")
+        file = open_h5(path)
+    except UnreadableError:
+        raise
     except Exception as err:
         yield Problem(path, "", f"not HDF5, or damaged: {err}", _AGAIN)
         return
     with file:
         yield from _check_open(file, path)
+
+
+def _signed(path: Path) -> bool:
+    """Whether a file begins as HDF5 does; HDF5 itself would want a lock to say it."""
+    with path.open("rb") as file:
+        return file.read(8) == b"\x89HDF\r\n\x1a\n"
 
 
 def _check_open(file: h5py.File, path: Path) -> Iterator[Problem]:
@@ -133,6 +144,8 @@ def _descriptions(file: h5py.File, path: Path, layout: Layout) -> tuple[dict[str
             if kind == "text" and not isinstance(parsed[name], str):
                 problems.append(Problem(path, name, f"expected text, got {parsed[name]!r}"))
         except Exception as err:
+            if passing := unreadable(path, err):
+                raise passing from err
             problems.append(Problem(path, name, f"expected the attribute, cannot read it: {err}"))
     if parsed.get("units", "m") != "m":
         problems.append(Problem(path, "units", f"expected 'm', got {parsed['units']!r}"))
@@ -175,6 +188,8 @@ def _check_field(
         for row in range(dataset.shape[0]) if field.dims[:1] == ("N",) else [()]:
             dataset[row]
     except Exception as err:
+        if passing := unreadable(path, err):
+            raise passing from err
         yield Problem(path, where, f"damaged: {err}", _AGAIN)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tofcapture.channels import parse_reach
 from tofcapture.errors import DataError, FormatError, TofError
+from tofcapture.files.disk import unreadable
 from tofcapture.files.layout import Field, Layout
 from tofcapture.frames import StereoInfo, TofInfo
 from tofcapture.rig import camera_from, camera_table, range_error_from, range_error_table
@@ -46,18 +47,31 @@ def write_attrs(file: h5py.File, layout: Layout, values: Mapping[str, Any]) -> N
         file.attrs[name] = dumps(known[name]) if kind == "JSON" else known[name]
 
 
-def open_checked(path: Path, layout: Layout) -> h5py.File:
-    """Open a file of a layout for reading.
+def open_h5(path: Path) -> h5py.File:
+    """Open a sealed file for reading; without locks, as nobody writes it and some disks have none.
 
-    :class:`DataError` when it is missing, truncated or not HDF5; :class:`FormatError` when it is of another format or version.
+    :class:`DataError` when it is missing, truncated or not HDF5; :class:`UnreadableError` when it cannot be opened just now.
     """
     try:
         # Chunks are single frames, read whole: HDF5 2 would keep 8 MB of each field of each open file for nothing.
-        file = h5py.File(path, "r", rdcc_nbytes=0)
+        return h5py.File(path, "r", rdcc_nbytes=0, locking=False)
     except FileNotFoundError as err:
-        raise DataError(f"{path}: expected a {layout.format} file, found nothing there") from err
+        raise DataError(f"{path}: expected a file, found nothing there") from err
     except DAMAGES as err:
-        raise DataError(f"{path}: cannot be opened as HDF5: {err}", hint=f"tofcapture check {path}") from err
+        raise failure(path, "cannot be opened as HDF5", err) from err
+
+
+def failure(path: Path, what: str, err: BaseException) -> DataError:
+    """Name a failure to read: no damage where the system says why, else perhaps."""
+    return unreadable(path, err) or DataError(f"{path}: {what}: {err}", hint=f"tofcapture check {path}")
+
+
+def open_checked(path: Path, layout: Layout) -> h5py.File:
+    """Open a file of a layout for reading.
+
+    Raises as :func:`open_h5` does, and :class:`FormatError` when it is of another format or version.
+    """
+    file = open_h5(path)
     try:
         _check_format(file, path, layout)
     except BaseException:
@@ -82,6 +96,8 @@ def attr(file: h5py.File, name: str, path: Path) -> Any:
     try:
         return file.attrs[name]
     except (*DAMAGES, TypeError) as err:
+        if passing := unreadable(path, err):
+            raise passing from err
         raise FormatError(f"{path}: expected the attribute {name!r}, cannot read it: {err}") from err
 
 
@@ -106,8 +122,7 @@ def find(file: h5py.File, field: Field, path: Path) -> h5py.Dataset:
     try:
         dataset = file.get(field.path)
     except DAMAGES as err:
-        hint = f"tofcapture check {path}"
-        raise DataError(f"{path}: /{field.path} cannot be opened: {err}", hint) from err
+        raise failure(path, f"/{field.path} cannot be opened", err) from err
     if not isinstance(dataset, h5py.Dataset):
         raise FormatError(f"{path}: expected the dataset /{field.path}, found none")
     if dataset.dtype.name not in field.dtypes:
@@ -122,7 +137,7 @@ def read(dataset: h5py.Dataset, path: Path, part: Any = ()) -> Array:
         return np.asarray(dataset[part])
     except DAMAGES as err:
         where = f"{dataset.name}{list(part) if part else ''}"
-        raise DataError(f"{path}: {where} is damaged: {err}", hint=f"tofcapture check {path}") from err
+        raise failure(path, f"{where} is damaged", err) from err
 
 
 def fetch(file: h5py.File, field: Field, path: Path, part: Any = ()) -> Array:

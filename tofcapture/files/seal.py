@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tofcapture.errors import DataError
+from tofcapture.errors import DataError, UnreadableError
+from tofcapture.files.disk import is_there, unreadable
 
 PARTIAL = ".partial"
 _SETTLED = 2.0  # s; a file changed since then may change again within one tick of the file system's clock
@@ -41,12 +42,21 @@ def digest_text(path: Path, digest: str) -> str:
 
 
 def stored_digest(path: Path) -> str | None:
-    """Read the digest that was stored when ``path`` was sealed; ``None`` when there is none or it cannot be read."""
+    """Read the digest that was stored when ``path`` was sealed; ``None`` when there is none or it is garbled.
+
+    Raises :class:`UnreadableError`: it is there, but cannot be read just now.
+    """
     try:
         words = digest_path(path).read_text(encoding="ascii").split()
-    except (OSError, UnicodeDecodeError):
+    except (FileNotFoundError, NotADirectoryError, UnicodeDecodeError):
         return None
+    except OSError as err:
+        raise _unreadable(digest_path(path), err) from err
     return words[0] if words else None
+
+
+def _unreadable(path: Path, err: OSError) -> DataError:
+    return unreadable(path, err) or UnreadableError(f"{path}: cannot be read: {err}")
 
 
 def sha256_of(path: Path) -> str:
@@ -87,13 +97,13 @@ def sealed_digest(path: Path, promised: str | None = None) -> str:
     """Hash a file, once per process, and make sure that it is the one that was sealed; hexadecimal.
 
     Its digest in a manifest counts where one is promised, else the one beside it. Without either there is nothing to compare
-    with. :class:`DataError` when the file cannot be read, or its bytes are not those that were sealed.
+    with. :class:`DataError` when its bytes are not those that were sealed; :class:`UnreadableError` when it cannot be read.
     """
     expected = promised or stored_digest(path)
     try:
         found = digest_once(path)
     except OSError as err:
-        raise DataError(f"{path}: cannot be read: {err}") from err
+        raise _unreadable(path, err) from err
     if expected not in (None, found):
         raise DataError(
             f"{path}: expected sha256 {str(expected)[:12]}..., got {found[:12]}...: changed after it was sealed",
@@ -104,7 +114,7 @@ def sealed_digest(path: Path, promised: str | None = None) -> str:
 
 def verify(path: Path, promised: str | None = None) -> None:
     """Raise what :func:`sealed_digest` raises; a file without any digest is not read, a garbled digest is one that differs."""
-    if promised is None and digest_path(path).exists():
+    if promised is None and is_there(digest_path(path)):
         promised = stored_digest(path) or "unreadable"
     if promised is not None:
         sealed_digest(path, promised)

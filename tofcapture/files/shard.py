@@ -396,7 +396,7 @@ class ShardWriter:
         self._file: h5py.File | None = None
 
     def __enter__(self) -> Self:
-        self._file = h5py.File(self._partial, "w")
+        self._file = h5py.File(self._partial, "w", locking=False)
         return self
 
     def __exit__(

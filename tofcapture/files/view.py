@@ -9,7 +9,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.errors import ConfigError, DataError, FormatError, TofError
+from tofcapture.errors import ConfigError, DataError, FormatError, PassedOver, TofError
+from tofcapture.files.disk import unreadable
 from tofcapture.files.hdf import (
     Array,
     attr,
@@ -34,11 +36,12 @@ from tofcapture.files.hdf import (
     write_attrs,
 )
 from tofcapture.files.layout import VIEW
-from tofcapture.files.seal import partial_path, seal
+from tofcapture.files.seal import digest_once, partial_path, seal, stored_digest
 from tofcapture.frames import ArmState, StereoFrame, TofBurst, Truth, View
 from tofcapture.rig import dumps_rig, loads_rig
 
 _SCENE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_NUMBERED = re.compile(r"view-(\d{3,})\.h5")
 _TRUTH = ("depth", "normals", "target", "T_tof_stereo", "T_flange_tof")
 
 
@@ -55,6 +58,79 @@ def check_scene_name(scene: str) -> str:
 def view_path(recording: Path, scene: str, index: int) -> Path:
     """Path of a view: ``RECORDING/views/<scene>/view-007.h5``."""
     return Path(recording) / "views" / check_scene_name(scene) / f"view-{index:03d}.h5"
+
+
+def view_number(path: Path) -> int | None:
+    """Find the number of a view in its file's exact name; ``None`` for ``view-007 (1).h5`` and other names."""
+    found = _NUMBERED.fullmatch(path.name)
+    return int(found[1]) if found and path.name == f"view-{int(found[1]):03d}.h5" else None
+
+
+def find_views(recording: Path) -> dict[str, tuple[Path, ...]]:
+    """Find the view files of a recording, by scene and number; what is passed over is named by a :class:`PassedOver`.
+
+    Raises :class:`UnreadableError`: a folder cannot be looked into.
+    """
+    scenes, others = list_views(recording)
+    for path, why in others.items():
+        warnings.warn(f"{path}: passed over: {why}", PassedOver, stacklevel=2)
+    return scenes
+
+
+def list_views(recording: Path) -> tuple[dict[str, tuple[Path, ...]], dict[Path, str]]:
+    """List a recording's view files by scene and number, and the files that are passed over, each with the reason.
+
+    A view has an exact name in a scene's folder, and a digest that no other has. Raises as :func:`find_views` does.
+    """
+    root, found, others = Path(recording) / "views", list[Path](), dict[Path, str]()
+    for folder in _entries(root):
+        files = [p for p in _entries(folder) if p.suffix.lower() == ".h5"] if folder.is_dir() else []
+        if files and not _SCENE.fullmatch(folder.name):
+            others[folder] = "expected the name of a scene"
+            continue
+        named = [p for p in files if view_number(p) is not None]
+        found += sorted(named, key=lambda p: view_number(p) or 0)
+        others |= {p: "expected a name like view-007.h5" for p in files if p not in named}
+    others |= _copies(found)
+    scenes: dict[str, tuple[Path, ...]] = {}
+    for path in found:
+        if path not in others:
+            scenes[path.parent.name] = (*scenes.get(path.parent.name, ()), path)
+    return scenes, others
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What is in a folder, by name; nothing where there is none."""
+    try:
+        return sorted(folder.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as err:
+        raise unreadable(folder, err) or DataError(f"{folder}: {err.strerror}") from err
+
+
+def _copies(paths: Iterable[Path]) -> dict[Path, str]:
+    """Say of which view a file is a copy, told by its digest; the original is the one that lies where its content says."""
+    same: dict[str, list[Path]] = {}
+    for path in paths:
+        try:
+            same.setdefault(stored_digest(path) or digest_once(path), []).append(path)
+        except (OSError, DataError):
+            continue  # whoever reads it says why it cannot be read
+    found = {}
+    for alike in (paths for paths in same.values() if len(paths) > 1):
+        original = next((p for p in alike if _place_of(p) == (p.parent.name, view_number(p))), alike[0])
+        found |= {p: f"a copy of {original.parent.name}/{original.name}" for p in alike if p != original}
+    return found
+
+
+def _place_of(path: Path) -> tuple[str, int] | None:
+    """Scene and number that a view says it has; ``None`` when it cannot be read."""
+    try:
+        with open_checked(path, VIEW) as file:
+            return text_attr(file, "scene", path), int(attr(file, "index", path))
+    except (DataError, ValueError, TypeError):
+        return None
 
 
 def _arrays(view: View) -> dict[str, Array]:
@@ -103,7 +179,7 @@ def write_view(path: Path, view: View) -> str:
     check_scene_name(view.scene)
     arrays, partial = _arrays(view), partial_path(path)
     try:
-        with h5py.File(partial, "w") as file:
+        with h5py.File(partial, "w", locking=False) as file:
             _write(file, view, arrays)
         with open_checked(partial, VIEW) as file:
             for name, data in arrays.items():

@@ -10,17 +10,16 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
-import sqlite3
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from tofcapture.errors import ConfigError, DataError
-from tofcapture.files.seal import replacing, sealed_digest
-from tofcapture.files.view import read_view, view_path
-from tofcapture.record.resources import is_full
+from tofcapture.errors import ConfigError, DataError, UnreadableError
+from tofcapture.files.disk import Database, is_there
+from tofcapture.files.seal import replacing, sealed_digest, stored_digest
+from tofcapture.files.view import read_view, view_number, view_path
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS views (
@@ -56,6 +55,10 @@ class JournalRow:
     step: str  # what was begun last for a view that is not sealed (record.observer.STEPS)
 
 
+class JobRefused(ConfigError):  # noqa: N818  nothing is broken
+    """What was asked for does not go with what the recording holds already; another job may."""
+
+
 def utc_now() -> str:
     """Give the time of day as files have it: ISO 8601, UTC, whole seconds."""
     return datetime.now(UTC).isoformat(timespec="seconds")
@@ -66,29 +69,15 @@ def journal_path(recording: Path) -> Path:
     return Path(recording) / "journal.sqlite"
 
 
-def open_database(path: Path, schema: str, what: str, hint: str) -> sqlite3.Connection:
-    """Open an SQLite database whose every transaction is on disk when its call returns.
-
-    Raises :class:`DataError`: the file is no such database.
-    """
-    try:
-        db = sqlite3.connect(path, isolation_level=None)
-        db.execute("PRAGMA journal_mode=WAL")
-        db.execute("PRAGMA synchronous=FULL")
-        db.executescript(schema)
-    except sqlite3.DatabaseError as err:
-        if is_full(err):
-            raise
-        raise DataError(f"{path}: not {what}: {err}", hint=hint) from err
-    return db
-
-
 class Journal:
-    """Open journal of a recording, whose folder exists; one transaction per call, on disk when the call returns."""
+    """Open journal of a recording, whose folder exists; one transaction per call, on disk when the call returns.
+
+    Raises as :class:`tofcapture.files.disk.Database` does.
+    """
 
     def __init__(self, recording: Path) -> None:
         hint = "move it away: it is rebuilt from the view files"
-        self._db = open_database(journal_path(recording), _SCHEMA, "a journal", hint)
+        self._db = Database(journal_path(recording), _SCHEMA, "a journal", hint)
 
     def close(self) -> None:
         """Close the database."""
@@ -97,44 +86,54 @@ class Journal:
     def rows(self, scene: str | None = None) -> list[JournalRow]:
         """All rows, or those of one scene, by scene and number."""
         where, values = ("WHERE scene = ?", (scene,)) if scene else ("", ())
-        found = self._db.execute(
+        found = self._db.do(
             f'SELECT scene, "index", pose, state, sha256, attempts, reason, step FROM views {where} ORDER BY scene, "index"',  # noqa: S608
             values,
         )
-        return [JournalRow(*row) for row in found]
+        rows = [JournalRow(*row) for row in found]
+        if wrong := next((row for row in rows if not _possible(row)), None):
+            raise self._db.damaged(f"it says {wrong}")
+        return rows
 
     def agree(self, facts: Mapping[str, Any]) -> None:
         """Remember facts of the recording (name -> JSON types), or compare with the remembered ones.
 
-        Raises :class:`ConfigError`: a fact differs from what the recording was begun with.
+        Raises :class:`ConfigError`: a fact differs from what the recording was begun with; :class:`JobRefused`: one that every
+        job brings.
         """
         for key, value in facts.items():
             text = json.dumps(value, sort_keys=True)
-            self._db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?)", (key, text))
-            known = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()[0]
+            self._db.do("INSERT OR IGNORE INTO meta VALUES (?, ?)", (key, text))
+            known = self._db.do("SELECT value FROM meta WHERE key = ?", (key,))[0][0]
             if known != text:
-                raise ConfigError(
-                    f"the recording was begun with another {key}: expected {_first_difference(json.loads(known), value)}",
+                try:
+                    expected = json.loads(known)
+                except (ValueError, TypeError) as err:
+                    raise self._db.damaged(f"{key}: {err}") from err
+                # The next job has the same station, but its own frames and seed.
+                kind = ConfigError if key == "station" else JobRefused
+                raise kind(
+                    f"the recording was begun with another {key}: expected {_first_difference(expected, value)}",
                     hint="go on with the same station and options, or record into another folder",
                 )
 
     def expect(self, scene: str, poses: Mapping[int, str]) -> set[int]:
         """Note planned views (index -> digest of the pose) and say which of them are there already.
 
-        Raises :class:`ConfigError`: a view of that number was recorded at another pose.
+        Raises :class:`JobRefused`: a view of that number was recorded at another pose.
         """
         sealed = {row.index: row.pose for row in self.rows(scene) if row.state == "sealed"}
         for index in sorted(sealed.keys() & poses.keys()):
             if sealed[index] != poses[index]:
-                raise ConfigError(
+                raise JobRefused(
                     f"view {index} of {scene!r} was recorded at pose {sealed[index]}, the plan wants {poses[index]}",
                     hint="use the same --seed and --station as before, or record into another folder",
                 )
         now = utc_now()
-        self._db.execute("BEGIN")
+        self._db.do("BEGIN")
         for index, pose in poses.items():
-            self._db.execute(_PLAN, (scene, index, pose, now, now))
-        self._db.execute("COMMIT")
+            self._db.do(_PLAN, (scene, index, pose, now, now))
+        self._db.do("COMMIT")
         return sealed.keys() & poses.keys()
 
     def step(self, scene: str, index: int, step: str) -> None:
@@ -160,13 +159,20 @@ class Journal:
     def adopt(self, scene: str, index: int, pose: str, sha256: str) -> None:
         """Note a verified file that the journal did not know to be sealed."""
         now = utc_now()
-        self._db.execute(_ADOPT, (scene, index, pose, sha256, now, now))
+        self._db.do(_ADOPT, (scene, index, pose, sha256, now, now))
 
     def _set(self, scene: str, index: int, change: str, *values: object) -> None:
-        self._db.execute(
+        self._db.do(
             f'UPDATE views SET {change}, changed_utc = ? WHERE scene = ? AND "index" = ?',  # noqa: S608
             (*values, utc_now(), scene, index),
         )
+
+
+def _possible(row: JournalRow) -> bool:
+    """Whether a row is one that a recorder writes."""
+    texts = (row.scene, row.pose, row.state, row.reason, row.step)
+    numbers = all(type(n) is int and n >= 0 for n in (row.index, row.attempts))
+    return numbers and all(isinstance(text, str) for text in texts) and isinstance(row.sha256, str | None)
 
 
 def _first_difference(known: Any, now: Any, where: str = "") -> str:
@@ -190,10 +196,10 @@ def reconcile(journal: Journal, recording: Path, scene: str) -> list[str]:
         path.unlink()
         done.append(f"{path}: removed, it was never finished")
     for path in sorted(folder.glob("view-*.h5")):
-        number = path.stem.removeprefix("view-")
-        if number.isdigit() and int(number) not in known:
-            done.append(_adopt(journal, path, scene, int(number)))
-    for index in sorted(i for i in known if not view_path(recording, scene, i).exists()):
+        number = view_number(path)
+        if number is not None and number not in known:
+            done.append(_adopt(journal, path, scene, number))
+    for index in sorted(i for i in known if not is_there(view_path(recording, scene, i))):
         journal.forget(scene, index, "the file was gone")
         done.append(f"view {index} of {scene!r}: its file is gone, it will be taken again")
     sealed = {row.index for row in journal.rows(scene) if row.state == "sealed"}
@@ -213,8 +219,8 @@ def _adopt(journal: Journal, path: Path, scene: str, index: int) -> str:
         sha256 = sealed_digest(path)
         view = read_view(path)
     except DataError as err:
-        if not sha256 and isinstance(err.__cause__, OSError):
-            raise  # its bytes cannot be read just now: that is no damage
+        if isinstance(err, UnreadableError) or (sha256 and stored_digest(path)):
+            raise  # its bytes are those that were sealed, or nobody knows: that is no damage
         return f"{path}: set aside as {_set_aside(path).name}: {err.message}"
     if (view.scene, view.index) != (scene, index):
         return f"{path}: set aside as {_set_aside(path).name}: it is view {view.index} of {view.scene!r}"

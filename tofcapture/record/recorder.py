@@ -14,23 +14,29 @@ import tomli_w
 
 from tofcapture import __version__
 from tofcapture.devices.clearance import route, workcell_of
+from tofcapture.devices.contract import check_burst, check_points, check_state, check_tof_info
+from tofcapture.devices.faults import ArmFault
 from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.station import Station
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 from tofcapture.files.seal import write_text
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, TofBurst, View
-from tofcapture.record.journal import Journal, keep_copy, reconcile, utc_now
+from tofcapture.record.journal import JobRefused, Journal, keep_copy, reconcile, utc_now
 from tofcapture.record.observer import Observer
 from tofcapture.record.plan import Plan, PlannedView, plan_scene
 from tofcapture.record.quality import REFUSE, RETAKE, broken_limits, measure, quality_table
-from tofcapture.record.resources import check_space, full_disk_named, hold_arm, hold_file
+from tofcapture.record.resources import HeldFolders, check_space, full_disk_named, hold_arm, hold_file
 from tofcapture.record.stopping import Stop, stoppable
 
 ATTEMPTS = 3  # at one view
 FAILURES_IN_A_ROW = 2  # that end the run: that is no bad pose, that is a broken device
 
 Progress = Callable[[int, int], None]
+
+
+class Refused(DeviceError):  # noqa: N818  the devices work
+    """What the devices handed over is of no use."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +91,10 @@ def record(
     BusyError
         Another recorder is at work on this recording, or moves this arm.
     DeviceError
-        Two views in a row failed three times each.
+        Two views in a row failed three times each; or the last one did, for the first time: the device may be broken. An arm,
+        or a driver's process, is in a state that needs a person.
+    ConfigError
+        A driver hands over what its description or the units exclude; or the folder is another one now.
     Stopped
         The observer, or ``tofcapture stop``, ended the run.
     """
@@ -99,9 +108,11 @@ def record(
             hint='a person can: [operator] driver = "console", in a terminal; or record without --turns',
         )
     if retake is not None and retake not in {view.index for view in plan.views}:
-        raise ConfigError(f"retake: expected a view from 0 to {len(plan.views) - 1}, got {retake}")
+        raise JobRefused(f"retake: expected a view from 0 to {len(plan.views) - 1}, got {retake}")
     with full_disk_named(recording), stoppable(f"{scene} into {recording}", station.arm.stop) as stop:
-        recording.mkdir(parents=True, exist_ok=True)
+        scene_folder = view_path(recording, scene, 0).parent
+        scene_folder.mkdir(parents=True, exist_ok=True)
+        folders = HeldFolders(recording.parent, recording, scene_folder.parent, scene_folder)
         if not (copy := recording / "station.toml").exists():
             write_text(copy, tomli_w.dumps(station.config))
         busy = f"{recording}: another recorder is at work"
@@ -110,18 +121,22 @@ def record(
         with lock, hold_arm(station.arm), closing(Journal(recording)) as journal:
             journal.agree({"station": station.describe(), "frames": frames, "world": station.world})
             repaired = reconcile(journal, recording, scene)
+            failed_before = {row.index for row in journal.rows(scene) if row.state == "failed"}
             kept = journal.expect(scene, {view.index: view.digest for view in plan.views})
             observer.planned(plan, kept, repaired)
-            run = _Run(station, scene, recording, frames, plan, journal, observer, stop)
+            run = _Run(station, scene, recording, frames, plan, journal, observer, stop, folders)
+            check_tof_info(station.tof.describe())
             again = kept if retake is None else {view.index for view in plan.views} - {retake}
             missing = [view for view in plan.views if view.index not in again]
             for n, planned in enumerate(missing):
                 if progress:
                     progress(len(kept) + n - len(run.reasons), len(plan.views))
                 observer.before_view(planned.index)
+                folders.check()
                 check_space(recording, len(missing) - n)
                 run.place_object(planned)
                 run.take(planned)
+            run.judge_the_last(failed_before)
             if progress:
                 progress(len(plan.views) - len(run.reasons), len(plan.views))
     return run.result(kept, repaired)
@@ -139,8 +154,10 @@ class _Run:
     journal: Journal
     observer: Observer
     stop: Stop
+    folders: HeldFolders
     turned: float | None = None  # how the object stands; after an earlier run nobody knows
     failed_in_a_row: int = 0
+    last_error: DeviceError | None = None
     recorded: list[int] = field(default_factory=list)
     reasons: dict[int, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -169,6 +186,8 @@ class _Run:
                 # A refused motion is refused for good.
                 if attempt == ATTEMPTS or isinstance(err, MotionRefused):
                     self.give_up(planned.index, err)
+                    if isinstance(err, ArmFault):
+                        raise  # that is no fault of the view: the next one would meet it as well
                     return
                 continue
             broken = broken_limits(numbers)
@@ -186,6 +205,7 @@ class _Run:
         state = self.station.arm.state()
         for joints in route(model, self.station.rig, workcell, state.joints, planned.joints):
             state = self.station.arm.move_to(joints)
+            check_state(state, joints)
         return state
 
     def expose(self, planned: PlannedView) -> tuple[TofBurst, StereoFrame, ArmState]:
@@ -199,21 +219,24 @@ class _Run:
     def check(
         self, tof: TofBurst, stereo: StereoFrame, before: ArmState, after: ArmState
     ) -> dict[str, float]:
-        """Measure what came, and refuse what is of no use (``record.quality``)."""
+        """Refuse what is not what a driver promises, measure what came, refuse what is of no use (``record.quality``)."""
+        check_burst(tof, self.station.tof.describe(), before)
+        check_points(stereo, self.station.stereo.describe())
         numbers = measure(tof, stereo, before, after, self.station.rig, self.frames)
         for limit in broken_limits(numbers):
             if limit.action == REFUSE:
-                raise DeviceError(limit.sentence(numbers), hint=limit.hint)
+                raise Refused(limit.sentence(numbers), hint=limit.hint)
         return numbers
 
     def seal(self, view: View) -> None:
         """Write a view under its name, then note it in the journal."""
         self.begin(view.index, "sealing")
         path = view_path(self.recording, self.scene, view.index)
-        if path.exists():
-            self.journal.forget(self.scene, view.index, "taken again")
-            keep_copy(path, "retaken")
-        digest = write_view(path, view)
+        with self.folders.unchanged():
+            if path.exists():
+                self.journal.forget(self.scene, view.index, "taken again")
+                keep_copy(path, "retaken")
+            digest = write_view(path, view)
         self.journal.seal(self.scene, view.index, digest)
         self.observer.sealed(view, digest)
         self.recorded.append(view.index)
@@ -229,8 +252,16 @@ class _Run:
             self.journal.fail(self.scene, index, error.message)
         self.observer.failed(index, error.message)
         self.reasons[index] = error.message
+        self.last_error = error
         self.failed_in_a_row += 1
         if self.failed_in_a_row >= FAILURES_IN_A_ROW:
+            raise error
+
+    def judge_the_last(self, failed_before: set[int]) -> None:
+        """Raise when the last view failed, and never before: no view after it shows that the devices work."""
+        error, own = self.last_error, (MotionRefused, Refused)
+        known = failed_before & self.reasons.keys()
+        if self.failed_in_a_row and error is not None and not isinstance(error, own) and not known:
             raise error
 
     def begin(self, index: int, step: str) -> None:

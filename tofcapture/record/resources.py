@@ -2,56 +2,34 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import hashlib
 import os
 import shutil
-import sqlite3
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
-from tofcapture.errors import BusyError, ConfigError, MotionRefused
+from tofcapture.errors import ConfigError, MotionRefused, TofError
+from tofcapture.files.disk import DiskFull, full_disk_named, hold_file, lock
 
 if TYPE_CHECKING:
     from tofcapture.devices import Arm
     from tofcapture.devices.station import Station
 
-_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
+__all__ = [
+    "DiskFull",
+    "HeldFolders",
+    "check_motion_allowed",
+    "check_space",
+    "full_disk_named",
+    "hold_arm",
+    "hold_file",
+]
+
 _VIEW_BYTES = 40e6  # a view of a full-size rig with truth, and room to spare
 _RESERVE_BYTES = 0.5e9
-
-
-class DiskFull(ConfigError):  # noqa: N818  the disk's state
-    """The disk takes no more; what is sealed stays, the same command goes on when there is room."""
-
-
-def is_full(error: BaseException) -> bool:
-    """Tell whether an error says that the disk takes no more: full, over quota, at a limit, or read-only."""
-    if isinstance(error, OSError) and error.errno in _NO_ROOM:
-        return True
-    text = str(error).lower()
-    if isinstance(error, sqlite3.OperationalError):
-        return "full" in text or "readonly" in text
-    # HDF5 hides errno in its own words, and fails once more when the file is closed.
-    return isinstance(error, (OSError, RuntimeError)) and "no space left" in text
-
-
-@contextmanager
-def full_disk_named(where: Path) -> Iterator[None]:
-    """Turn every way in which libraries say that the disk is full into :class:`DiskFull`."""
-    try:
-        yield
-    except (OSError, RuntimeError, sqlite3.OperationalError) as err:
-        if not is_full(err):
-            raise
-        raise DiskFull(
-            f"{where}: the disk takes no more: {str(err).partition('(')[0].strip()}",
-            hint="free some space, then run the same again",
-        ) from err
 
 
 def check_space(recording: Path, views: int) -> None:
@@ -65,19 +43,47 @@ def check_space(recording: Path, views: int) -> None:
         )
 
 
-@contextmanager
-def hold_file(path: Path, what: str, hint: str) -> Iterator[None]:
-    """Hold a lock file that names this process; the lock goes with the process, however that ends.
+class HeldFolders:
+    """The folders that a run writes into, each told by device and inode, from the top down.
 
-    Raises :class:`BusyError`: another process holds it: ``what``, its id, ``hint``.
+    A path says little: a disk that was unmounted leaves an empty folder of the same name.
     """
-    with path.open("a+", encoding="ascii") as file:
-        file.seek(0)
-        _lock(file, f"{what} (process {file.read().strip() or 'unknown'})", hint)
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
-        yield
+
+    def __init__(self, *folders: Path) -> None:
+        self._known = {folder: identity_of(folder) for folder in folders}
+
+    def check(self) -> None:
+        """Raise :class:`FolderGone` unless every folder is the one that it was."""
+        for folder, known in self._known.items():
+            if (now := identity_of(folder)) != known:
+                why = "is not there any more" if now is None else "is another folder now"
+                raise FolderGone(
+                    f"{folder} {why}: moved, deleted or unmounted", hint="put it back or mount it, then go on"
+                )
+
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """Check before and after; an error of the disk in between is that of a folder that went."""
+        self.check()
+        try:
+            yield
+        except (OSError, TofError):
+            self.check()
+            raise
+        self.check()
+
+
+class FolderGone(ConfigError):  # noqa: N818  the disk's state
+    """A folder that is recorded into was moved, deleted or unmounted; what is sealed is where it went."""
+
+
+def identity_of(folder: Path) -> tuple[int, int] | None:
+    """Device and inode of a folder; ``None`` where there is none."""
+    try:
+        found = folder.stat()
+    except OSError:
+        return None
+    return (found.st_dev, found.st_ino) if folder.is_dir() else None
 
 
 def holder(path: Path) -> int | None:
@@ -107,15 +113,8 @@ def hold_arm(arm: Arm) -> Iterator[None]:
     except PermissionError:  # another user's file in a sticky folder can be locked, but not created
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     with os.fdopen(handle) as file:
-        _lock(file, f"the arm {info.model} {info.serial} is moved by another process", "tofcapture status")
+        lock(file, f"the arm {info.model} {info.serial} is moved by another process", "tofcapture status")
         yield
-
-
-def _lock(file: TextIO, busy: str, hint: str) -> None:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as err:
-        raise BusyError(busy, hint=hint) from err
 
 
 def check_motion_allowed(station: Station, allowed: bool, hint: str) -> None:

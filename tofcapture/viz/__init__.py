@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from tofcapture.errors import DataError, FormatError
+from tofcapture.files.hdf import open_h5
 from tofcapture.poses import rotation_angle
 from tofcapture.rig import Rig, load_rig
 from tofcapture.viz.shots import Calibration, Shot, Source
@@ -61,15 +62,10 @@ def _folder(path: Path) -> Source:
 
 
 def _hdf5(path: Path) -> Source:
-    import h5py
-
     from tofcapture.viz.sources import shard_source, view_source
 
-    try:
-        with h5py.File(path, "r") as file:
-            kind = file.attrs.get("format", "")
-    except OSError as err:
-        raise DataError(f"{path}: cannot read the file: {err}", hint=f"tofcapture check {path}") from err
+    with open_h5(path) as file:
+        kind = file.attrs.get("format", "")
     return shard_source(path) if kind == "tofcapture-shard" else view_source(path)
 
 

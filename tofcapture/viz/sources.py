@@ -15,7 +15,7 @@ from tofcapture.errors import DataError, TofError
 from tofcapture.files.layout import BOARD_SCENE
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.shard import ShardReader
-from tofcapture.files.view import read_view
+from tofcapture.files.view import find_views, read_view
 from tofcapture.frames import View
 from tofcapture.ops.phase import Decoder
 from tofcapture.poses import Float64, transform_points
@@ -34,7 +34,7 @@ def recording_source(recording: Path) -> Source:
     DataError
         It holds no view.
     """
-    paths = [p for scene in scenes_of(recording) for p in scene_views(recording, scene)]
+    paths = [path for views in scenes_of(recording).values() for path in views]
     rig, arm = rig_of(recording, paths[0]), arm_of(recording)
     names = [f"{p.parent.name} {number_of(p)}" for p in paths]
     title = f"recording {recording.resolve().name}"
@@ -50,8 +50,8 @@ def view_source(path: Path) -> Source:
     return Source(f"view {path.name}", [name], lambda _: view_shot(view, rig, arm_of(home)), rig)
 
 
-def scenes_of(recording: Path) -> list[str]:
-    """Names of the scenes that a recording has views of.
+def scenes_of(recording: Path) -> dict[str, list[Path]]:
+    """View files of a recording by scene.
 
     Raises
     ------
@@ -62,13 +62,13 @@ def scenes_of(recording: Path) -> list[str]:
         raise DataError(
             f"{recording}: no such file or folder", hint="give a recording or one of its view files"
         )
-    found = sorted({p.parent.name for p in (recording / "views").glob("*/view-*.h5")})
+    found = find_views(recording)
     if not found:
         raise DataError(
             f"{recording}: expected a recording with views, found none",
             hint="tofcapture record --scene NAME --out RECORDING",
         )
-    return found
+    return {scene: list(views) for scene, views in found.items()}
 
 
 def scene_views(recording: Path, scene: str | None = None) -> list[Path]:
@@ -83,7 +83,7 @@ def scene_views(recording: Path, scene: str | None = None) -> list[Path]:
     if scene is not None and scene not in found:
         raise DataError(f"{recording}: no scene {scene}", hint=f"it has {', '.join(found)}")
     name = scene or next((n for n in found if n != BOARD_SCENE), found[0])
-    return sorted((recording / "views" / name).glob("view-*.h5"))
+    return found[name]
 
 
 def pick_view(path: Path, scene: str | None, view: int | None) -> Path:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.channels import channels_in_words, frequencies, mismatch, wrap_table
-from tofcapture.errors import ConfigError, DataError
+from tofcapture.errors import ConfigError, DataError, UnreadableError
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoder, information
 from tofcapture.ops.phase.float32 import tap_rows
@@ -332,17 +332,17 @@ def _check_counts(raw: NDArray[np.float64], info: TofInfo, where: str) -> None:
 
 
 def _from_h5(path: Path, view: int) -> RawInput:
-    import h5py
-
+    from tofcapture.files.hdf import open_h5
     from tofcapture.files.shard import ShardReader
     from tofcapture.files.view import read_view
 
     try:
-        with h5py.File(path, "r") as file:
+        with open_h5(path) as file:
             kind = str(file.attrs.get("format", ""))
-    except OSError as err:
-        hint = f"tofcapture check {path}" if path.suffix == ".h5" else _KINDS
-        raise DataError(f"{path}: cannot read the file: {err}", hint=hint) from err
+    except UnreadableError:
+        raise
+    except DataError as err:
+        raise DataError(err.message, hint=err.hint if path.suffix == ".h5" else _KINDS) from err
     if kind != "tofcapture-shard":
         found = read_view(path)
         return RawInput(found.tof.raw, found.tof.celsius, found.tof.info, found.rig.tof, str(path))

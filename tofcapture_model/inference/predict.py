@@ -16,6 +16,7 @@ from torch import Tensor
 
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
+from tofcapture.files.disk import check_writable
 from tofcapture.frames import TofInfo
 from tofcapture_model.config import BASELINES
 from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
@@ -301,6 +302,7 @@ def _expect_folder(out: Path) -> None:
         raise ConfigError(
             f"--out {out}: expected a folder, but {there} is a file", hint="name another folder"
         )
+    check_writable(out, "name another folder: --out")
 
 
 def predict(

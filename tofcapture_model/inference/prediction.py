@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.colours import png_bytes
-from tofcapture.files.seal import write_text
+from tofcapture.files.disk import full_disk_named
+from tofcapture.files.seal import replacing, write_text
 
 Float32 = NDArray[np.float32]
 
@@ -75,7 +76,17 @@ def write_prediction(prediction: Prediction, out: Path) -> dict[str, str]:
     Returns
     -------
     Path of every file by its name.
+
+    Raises
+    ------
+    DiskFull
+        The disk takes no more; no file under its final name is cut short.
     """
+    with full_disk_named(out):
+        return _write(prediction, out)
+
+
+def _write(prediction: Prediction, out: Path) -> dict[str, str]:
     out.mkdir(parents=True, exist_ok=True)
     (out / "error.npy").unlink(missing_ok=True)
     arrays = {
@@ -84,12 +95,14 @@ def write_prediction(prediction: Prediction, out: Path) -> dict[str, str]:
         if (array := getattr(prediction, name)) is not None
     }
     for name, array in arrays.items():
-        np.save(out / name, array)
+        with replacing(out / name) as partial, partial.open("wb") as file:
+            np.save(file, array)
     tenth_mm = np.clip(np.rint(prediction.depth * 1e4), 0, 65535).astype(np.uint16)
     colours = ((prediction.normals * [1, -1, -1] + 1) * 127.5).clip(0, 255).astype(np.uint8)
-    (out / "depth.png").write_bytes(png_bytes(tenth_mm))
-    (out / "normals.png").write_bytes(png_bytes(colours))
-    (out / "cloud.ply").write_bytes(ply_bytes(prediction))
+    pictures = {"depth.png": png_bytes(tenth_mm), "normals.png": png_bytes(colours)}
+    for name, data in {**pictures, "cloud.ply": ply_bytes(prediction)}.items():
+        with replacing(out / name) as partial:
+            partial.write_bytes(data)
     write_text(
         out / "units.txt",
         "npy, ply: metres, ToF frame (x right, y down, z forward)\n"

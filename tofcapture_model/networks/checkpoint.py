@@ -18,7 +18,7 @@ from torch import Tensor
 
 from tofcapture.errors import ConfigError, DataError, FormatError, TofError
 from tofcapture.files.manifest import COMBINATIONS, SceneEntry, load_manifest, object_of
-from tofcapture.files.seal import replacing
+from tofcapture.files.seal import replacing, write_text
 from tofcapture.files.shard import ShardReader
 from tofcapture_model.config import Config, dumps_config, loads_config
 from tofcapture_model.networks import Model, build_model
@@ -82,7 +82,7 @@ def save_model(
             )
     header = {"format": FORMAT, "version": str(VERSION), "config": text}
     write_tensors(path, weights, {**header, "provenance": json.dumps(provenance, sort_keys=True)})
-    path.with_suffix(".toml").write_text(text, encoding="utf-8")
+    write_text(path.with_suffix(".toml"), text)
     return path
 
 

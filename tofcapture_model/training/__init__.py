@@ -9,9 +9,11 @@ import hashlib
 import json
 import math
 import os
+import signal
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeVar
@@ -22,6 +24,7 @@ from torch.utils.data import DataLoader
 
 from tofcapture.cli.kit import Report
 from tofcapture.errors import ConfigError, DataError
+from tofcapture.files.disk import NoLocksError, check_writable, hold_file
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Config, Stage, dumps_config
@@ -87,6 +90,25 @@ def processes(device: str) -> Iterator[Group]:
         yield Group(torch.distributed.get_rank(), world, own)
     finally:
         torch.distributed.destroy_process_group()
+
+
+@contextmanager
+def held(out: Path, group: Group) -> Iterator[None]:
+    """Hold the folder of a run, made when missing: two runs in one folder would overwrite each other.
+
+    A disk that keeps no locks, as on some clusters, holds nobody off. :class:`BusyError`: another process trains there;
+    :class:`ConfigError`: it cannot be written.
+    """
+    with ExitStack() as stack:
+        if group.rank == 0:
+            check_writable(out, "name another folder: --out")
+            out.mkdir(parents=True, exist_ok=True)
+            lock = hold_file(
+                out / ".lock", f"{out}: another training is at work", "wait, or name another --out"
+            )
+            with suppress(NoLocksError):
+                stack.enter_context(lock)
+        yield
 
 
 def _own_gpu(device: torch.device, world: int) -> torch.device:
@@ -202,14 +224,43 @@ class Run:
         self.position = Position(**state)
         self._log, self._told = Log(None), (0.0, 1.0)  # done and all, of the stage
         self._started = self._saved = time.monotonic()
+        self._usual: dict[int, Any] = {}  # what signals did before
+        self._asked: int | None = None
 
     def __enter__(self) -> Self:
-        """Open the log."""
+        """Open the log; from here on Ctrl-C and SIGTERM wait for the end of a step, a second one does not."""
         self._log = Log(self.out if self.group.rank == 0 else None)
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if callable(usual := signal.getsignal(number)):
+                    self._usual[number] = usual
+                    signal.signal(number, self._note)
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._restore()
         self._log.close()
+
+    def _note(self, number: int, _: object) -> None:
+        """Remember a signal."""
+        self._asked = number
+        signal.signal(number, self._usual[number])
+
+    def _restore(self) -> None:
+        for number, usual in self._usual.items():
+            signal.signal(number, usual)
+        self._usual = {}
+
+    @property
+    def asked_to_leave(self) -> bool:
+        """Whether somebody wants the run to end, resumable."""
+        return self._asked is not None
+
+    def leave_if_asked(self) -> None:
+        """Do what the signal that came means."""
+        if self._asked is not None:
+            self._restore()
+            signal.raise_signal(self._asked)
 
     def batches(self, data: FrameDataset, stage: Stage, workers: int) -> Iterator[tuple[Frame, Target]]:
         """Yield the stage's batches, on the device, from where the run is to its end; validates after epochs."""

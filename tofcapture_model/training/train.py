@@ -24,7 +24,17 @@ from tofcapture_model.losses import Objective
 from tofcapture_model.networks import Model, build_model, compile_unets, select_stage, training_loss
 from tofcapture_model.networks.checkpoint import save_model
 from tofcapture_model.networks.joint import JointModel
-from tofcapture_model.training import Group, Moments, Position, Run, Trained, eagerly, processes, source_of
+from tofcapture_model.training import (
+    Group,
+    Moments,
+    Position,
+    Run,
+    Trained,
+    eagerly,
+    held,
+    processes,
+    source_of,
+)
 from tofcapture_model.training.card import write_card
 
 WARM_UP = 0.02  # of a stage, with a cosine schedule
@@ -78,7 +88,9 @@ def train(
     Raises
     ------
     ConfigError
-        The folder holds another run, or ``start`` another network.
+        The folder holds another run or cannot be written, or ``start`` another network.
+    BusyError
+        Another process trains in the folder.
     DataError
         A split is empty, or a loss is not finite: no step is taken then.
     """
@@ -87,11 +99,12 @@ def train(
     datasets = [Path(dataset), *map(Path, also)]
     for each in datasets:
         load_manifest(each)  # says what is wrong with it, before anything is started
-    with processes(device) as group:
+    out = Path(out)
+    with processes(device) as group, held(out, group):
         torch.manual_seed(config.training.seed)
         model = build_model(config).to(group.device)
         source = source_of(model, config, datasets, start)
-        run = Run(config, model, group, datasets[0], Path(out), source, minutes, report)
+        run = Run(config, model, group, datasets[0], out, source, minutes, report)
         if run.position.stage == len(config.stages):
             return run.ended()
         if config.training.compile:
@@ -114,9 +127,10 @@ def train(
                     learner.step(rate)
                     run.stepped(stage, loss, rate)
                     stop = stop_after is not None and run.position.step >= stop_after
-                    run.save_now_and_then(learner.moments(), now=stop)
+                    run.save_now_and_then(learner.moments(), now=stop or run.asked_to_leave)
                     if stop:
                         return run.ended()
+                    run.leave_if_asked()
         if group.rank == 0:
             _finish(run, source)
             run.save_now_and_then(learner.moments(), now=True)

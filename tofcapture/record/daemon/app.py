@@ -87,7 +87,7 @@ class Route:
     def document(self) -> Schema:
         """Write the route's OpenAPI operation."""
         named = re.findall(r"{(\w+)}", self.path) + (["after"] if self.path == _STREAM else [])
-        usual = (200, 400, 401, 403, 408, 413, 415, 422) if self.body else (200, 401, 403)
+        usual = (200, 400, 401, 403, 408, 413, 415, 422, 500, 507) if self.body else (200, 401, 403, 500)
         codes = sorted({*usual, *self.codes, *([404] if "{" in self.path else [])})
         answer = _content(self.answer)
         out: Schema = {

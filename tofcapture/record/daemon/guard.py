@@ -13,19 +13,26 @@ import os
 import socket
 import struct
 import time
+import traceback
 from collections.abc import Awaitable, Callable, Mapping
+from http import HTTPStatus
 from typing import Any
 
 from aiohttp import web
+from aiohttp.http_exceptions import PayloadEncodingError
 from aiohttp.web_protocol import RequestHandler
 
-from tofcapture.errors import BusyError, DataError, TofError
+from tofcapture.errors import BusyError, DataError, TofError, UnreadableError
+from tofcapture.files.disk import DamagedError, DiskFull
 
 BODY_LIMIT = 64 * 1024  # bytes
 MOST_CONNECTIONS = 1024
 MOST_STRANGERS = 256  # connections of each listener that have not shown yet that they may ask
 IDLE = 30.0  # s that a connection may take to send a request, or to take an answer
 _BODY = 5.0  # s for a body
+_CODES: dict[type[TofError], int] = {
+    DamagedError: 500, UnreadableError: 500, DataError: 404, BusyError: 409, DiskFull: 507, TofError: 422
+}  # fmt: skip
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -160,12 +167,34 @@ async def _handle(request: web.Request, handler: Handler) -> web.StreamResponse:
         allow = {"Allow": err.headers["Allow"]} if "Allow" in err.headers else None
         return refusal(err.status, "http", err.reason, headers=allow)
     except TofError as err:
-        code = 404 if isinstance(err, DataError) else 409 if isinstance(err, BusyError) else 422
+        code = next(code for kind, code in _CODES.items() if isinstance(err, kind))
         return refusal(code, type(err).__name__, err.message, err.hint)
     except TimeoutError:
         answer = refusal(408, "slow", f"the body did not come within {_BODY:.0f} s")
         answer.force_close()
         return answer
+    except PayloadEncodingError as err:
+        return refusal(400, "http", f"the body cannot be read: {err.message}")
+    except Exception as err:
+        traceback.print_exc()
+        return refusal(500, type(err).__name__, str(err), "the daemon's log says where")
+
+
+def speak_json() -> None:
+    """Have aiohttp's own refusals, of what is no HTTP, look like ours."""
+    usual = RequestHandler.handle_error
+
+    def handle_error(handler: RequestHandler, request: Any, status: int = 500, *more: Any) -> web.Response:
+        usual(handler, request, status, *more)  # logs it, and raises where an answer has begun
+        answer = refusal(status, "http", _phrase(status), "send HTTP/1.1", HEADERS)
+        answer.force_close()
+        return answer
+
+    RequestHandler.handle_error = handle_error  # type: ignore[method-assign, assignment]
+
+
+def _phrase(status: int) -> str:
+    return HTTPStatus(status).description or HTTPStatus(status).phrase
 
 
 async def body_of(request: web.Request) -> Any:

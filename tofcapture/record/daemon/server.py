@@ -21,7 +21,7 @@ from aiohttp.http_exceptions import HttpProcessingError
 
 from tofcapture.errors import BusyError, ConfigError, UsageError
 from tofcapture.record.daemon.app import PAGE_FILES, Api
-from tofcapture.record.daemon.guard import Guard
+from tofcapture.record.daemon.guard import Guard, speak_json
 from tofcapture.record.daemon.settings import Settings, StateFolder, only_one, token_of
 from tofcapture.record.daemon.store import Store, Streams
 from tofcapture.record.daemon.supervisor import Supervisor
@@ -76,6 +76,7 @@ async def _serve(
         shutdown_timeout=0.5,
         lingering_time=1.0,
     )
+    speak_json()
     logging.getLogger("aiohttp.server").addFilter(_is_our_fault)
     await runner.setup()
     end = asyncio.Event()

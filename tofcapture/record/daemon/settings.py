@@ -14,6 +14,7 @@ from tofcapture.errors import ConfigError
 from tofcapture.record.resources import hold_file
 
 PICTURES = ("amplitude", "depth", "stereo")  # of the latest view
+_ELSEWHERE = "give a folder of your own: --state FOLDER, or TOFCAPTURE_STATE"
 _SOCKET_LIMIT = 107  # bytes of a Unix socket's path that Linux takes
 
 
@@ -45,7 +46,10 @@ class Settings:
 def state_folder(root: Path | None) -> StateFolder:
     """Find the daemon's folder: ``root``, ``$TOFCAPTURE_STATE``, systemd's, or ``~/.local/state/tofcapture``."""
     named = root or os.environ.get("TOFCAPTURE_STATE") or os.environ.get("STATE_DIRECTORY")
-    base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    try:
+        base = os.environ.get("XDG_STATE_HOME") or named or Path.home() / ".local" / "state"
+    except RuntimeError as err:
+        raise ConfigError(f"the daemon's folder: {err}", hint=_ELSEWHERE) from err
     return StateFolder(Path(named or Path(base) / "tofcapture").absolute())
 
 
@@ -60,7 +64,10 @@ def open_folder(root: Path | None) -> StateFolder:
             f"{state.socket}: expected at most {_SOCKET_LIMIT} bytes, a socket's path holds no more",
             hint="give a shorter --state",
         )
-    state.root.mkdir(mode=0o700, parents=True, exist_ok=True)
+    try:
+        state.root.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as err:
+        raise ConfigError(f"{state.root}: cannot be made: {err.strerror}", hint=_ELSEWHERE) from err
     if state.root.stat().st_uid != os.getuid():
         raise ConfigError(
             f"{state.root}: belongs to another user", hint="give a folder of your own with --state"

@@ -6,22 +6,25 @@ Events go to every client from where it left off; a slow one is dropped, never w
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
-import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from aiohttp import web
 
-from tofcapture.errors import BusyError, DataError
+from tofcapture.errors import BusyError, DataError, TofError
+from tofcapture.files.disk import Database
 from tofcapture.record.daemon.guard import HEADERS, refusal
-from tofcapture.record.journal import open_database, utc_now
-from tofcapture.record.resources import full_disk_named
+from tofcapture.record.journal import utc_now
 
 KEPT_EVENTS = 10_000
 MOST_WAITING = 1_000
+STATES = ("queued", "running", "done", "failed", "stopped")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")  # of a scene or a recording
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS jobs (
@@ -77,25 +80,21 @@ class Event:
 
 
 class Store:
-    """The open database; one transaction per call.
+    """The open database; one transaction per call, which never waits: the daemon has other things to do.
 
-    Raises :class:`DataError`: the file is no such database; :class:`DiskFull`: by every method that writes.
+    Raises as :class:`tofcapture.files.disk.Database` does.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._db = open_database(path, _SCHEMA, "a daemon's queue", "move it away; recordings do not need it")
-        there = {row[1] for row in self._do("PRAGMA table_info(jobs)")}
+        hint = "move it away; recordings do not need it"
+        self._db = Database(path, _SCHEMA, "a daemon's queue", hint, patience=0.0)
+        there = {row[1] for row in self._db.do("PRAGMA table_info(jobs)")}
         for column in {"retake", "place"} - there:  # a queue of an earlier version
-            self._do(f"ALTER TABLE jobs ADD COLUMN {column} INTEGER")
+            self._db.do(f"ALTER TABLE jobs ADD COLUMN {column} INTEGER")
 
     def close(self) -> None:
         """Close the database."""
         self._db.close()
-
-    def _do(self, sql: str, values: Sequence[object] = ()) -> sqlite3.Cursor:
-        with full_disk_named(self._path):
-            return self._db.execute(sql, values)
 
     def add(self, request: Mapping[str, Any]) -> tuple[Job, bool]:
         """Queue a job, or find the one that the same request made; the second value tells whether it is new.
@@ -113,12 +112,12 @@ class Store:
             raise BusyError(f"{waiting} jobs are waiting already", hint="let some of them finish")
         now = utc_now()
         values = [request.get(key) for key in WISH]
-        made = self._do(
+        made = self._db.insert(
             f"INSERT INTO jobs (request_id, {', '.join(WISH[1:])}, state, utc, changed_utc)"  # noqa: S608
             " VALUES (?, ?, ?, ?, ?, ?, ?, 'queued', ?, ?)",
             [*values, now, now],
-        ).lastrowid
-        return self.job(int(made or 0)), True
+        )
+        return self.job(made), True
 
     def job(self, number: int) -> Job:
         """Find a job. Raises :class:`DataError`: there is none of that number."""
@@ -127,8 +126,10 @@ class Store:
         return found[0]
 
     def _jobs(self, where: str, *values: object) -> list[Job]:
-        rows = self._do(f"SELECT {_FIELDS} FROM jobs {where}", values)  # noqa: S608
-        return [Job(*row) for row in rows]
+        jobs = [Job(*row) for row in self._db.do(f"SELECT {_FIELDS} FROM jobs {where}", values)]  # noqa: S608
+        if wrong := next((job for job in jobs if not _possible(job)), None):
+            raise self._db.damaged(f"it says {wrong}")
+        return jobs
 
     def ended(self) -> list[Job]:
         """List the 100 jobs that ended last, the last one first."""
@@ -155,15 +156,15 @@ class Store:
         # One statement, so that a crash leaves the old order or the new one. Numbers of later jobs are larger than any place; a
         # running job that is put back has place 0, ahead of all.
         cases = " ".join(f"WHEN {n} THEN {place}" for place, n in enumerate(ahead, start=1))
-        self._do(f"UPDATE jobs SET place = CASE id {cases} ELSE 0 END WHERE {_AHEAD}")  # noqa: S608
+        self._db.do(f"UPDATE jobs SET place = CASE id {cases} ELSE 0 END WHERE {_AHEAD}")  # noqa: S608
 
     def counts(self) -> dict[str, int]:
         """Count the jobs in each state."""
-        return dict(self._do("SELECT state, count(*) FROM jobs GROUP BY state").fetchall())
+        return dict(self._db.do("SELECT state, count(*) FROM jobs GROUP BY state"))
 
     def move(self, number: int, state: str, reason: str = "") -> Job:
         """Put a job into another state."""
-        self._do(
+        self._db.do(
             "UPDATE jobs SET state = ?, reason = ?, changed_utc = ? WHERE id = ?",
             [state, reason, utc_now(), number],
         )
@@ -173,28 +174,42 @@ class Store:
         """Keep an event; the oldest go when there are too many."""
         now = utc_now()
         text = json.dumps(data, allow_nan=False)
-        made = self._do("INSERT INTO events (utc, kind, data) VALUES (?, ?, ?)", [now, kind, text]).lastrowid
-        number = int(made or 0)
+        number = self._db.insert("INSERT INTO events (utc, kind, data) VALUES (?, ?, ?)", [now, kind, text])
         if number % 1000 == 0:
-            self._do("DELETE FROM events WHERE id <= ?", [number - KEPT_EVENTS])
+            self._db.do("DELETE FROM events WHERE id <= ?", [number - KEPT_EVENTS])
         return Event(number, now, kind, data)
 
     def events(self, after: int) -> Iterator[Event]:
-        """List events of larger id, oldest first."""
-        rows = self._do("SELECT id, utc, kind, data FROM events WHERE id > ? ORDER BY id", [after]).fetchall()
-        return (Event(number, utc, kind, json.loads(data)) for number, utc, kind, data in rows)
+        """List events of larger id, oldest first; a garbled one is left out."""
+        rows = self._db.do("SELECT id, utc, kind, data FROM events WHERE id > ? ORDER BY id", [after])
+        return _readable(rows)
 
     def log(self, since: str) -> list[Event]:
         """List what happened since a UTC string but single steps, oldest first, the newest 500 at most."""
-        rows = self._do(
+        rows = self._db.do(
             "SELECT id, utc, kind, data FROM events WHERE utc >= ? AND kind != 'step' ORDER BY id DESC LIMIT ?",
             [since, _LOG_LINES],
-        ).fetchall()
-        return [Event(number, utc, kind, json.loads(data)) for number, utc, kind, data in rows[::-1]]
+        )
+        return list(_readable(rows[::-1]))
 
     def last_event(self) -> int:
         """Find the id of the newest event, 0 when there is none."""
-        return int(self._do("SELECT coalesce(max(id), 0) FROM events").fetchone()[0])
+        return int(self._db.do("SELECT coalesce(max(id), 0) FROM events")[0][0])
+
+
+def _readable(rows: list[Any]) -> Iterator[Event]:
+    for number, utc, kind, data in rows:
+        with contextlib.suppress(ValueError, TypeError):
+            yield Event(int(number), str(utc), str(kind), dict(json.loads(data)))
+
+
+def _possible(job: Job) -> bool:
+    """Whether a job is one that was queued: what a flipped bit makes of it must not reach a path or a device."""
+    numbers = all(type(n) is int and n > 0 for n in (job.id, job.views, job.frames))
+    names = all(isinstance(n, str) and _NAME.fullmatch(n) for n in (job.recording, job.scene))
+    texts = all(isinstance(text, str) for text in (job.reason, job.utc, job.changed_utc))
+    seed, request = type(job.seed) is int or job.seed is None, isinstance(job.request_id, str | None)
+    return numbers and names and texts and seed and request and job.state in STATES
 
 
 MOST_STREAMS = 512
@@ -242,7 +257,7 @@ class Streams:
         try:
             await response.prepare(request)
             await self._feed(response, queue, after)
-        except (ConnectionError, TimeoutError):
+        except (ConnectionError, TimeoutError, TofError):
             pass
         finally:
             self._queues.discard(queue)

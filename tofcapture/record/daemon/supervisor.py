@@ -9,23 +9,25 @@ import os
 import shutil
 import sys
 import time
+import traceback
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import asdict
 from typing import Any, Self
 
 from tofcapture import __version__
-from tofcapture.errors import BusyError, UsageError
+from tofcapture.errors import BusyError, TofError, UsageError
 from tofcapture.files.view import check_scene_name
 from tofcapture.record.daemon.settings import Settings
 from tofcapture.record.daemon.store import WISH, Event, Job, Store
 from tofcapture.record.journal import utc_now
-from tofcapture.record.resources import DiskFull
+from tofcapture.record.resources import identity_of
 
 GRACE = 3.0  # s from the order to stop until a recorder is killed
 _SILENT = 3.0  # s without a sign of life until health says so
 _HEALTH = 2.0  # s between health events
 _BACKOFF = (0.2, 1.0, 3.0)  # s before a crashed recorder of a simulated arm is started again
+_LOCKED = 0.2  # s until a database that another process holds is tried again
 _LINE = 4 * 1024 * 1024  # bytes; a plan of thousands of views fits
 _STOPPED = "stopped by the operator"
 _ENDS = {"done", "stopped", "error"}  # kinds of a recorder's last message
@@ -167,6 +169,9 @@ class Supervisor:
         self._recorder: RecorderProcess | None = None
         self._wake = asyncio.Event()
         self._busy = self._stopping = self._closing = False
+        self._root = identity_of(settings.root)
+        self._begun: set[str] = set()  # recordings, by this daemon
+        self._look_again = False
         self.reason, self.fault = "", ""  # why it rests; the kind of error, where one is why
         if settings.station is None:
             self.progress.simulated = True
@@ -192,6 +197,8 @@ class Supervisor:
         """Queue a job; see :meth:`Store.add`."""
         self._check_clear(request["clear"])
         check_scene_name(request["scene"])
+        if not (self.settings.root / request["recording"]).is_dir():
+            self._begun.discard(request["recording"])  # whoever asks anew may begin anew
         job, new = self.store.add({key: request[key] for key in WISH if key in request})
         if new:
             self._say("queued", job=asdict(job))
@@ -222,7 +229,7 @@ class Supervisor:
     def resume(self, clear: bool) -> None:
         """Go on."""
         self._check_clear(clear)
-        self.reason = self.fault = ""
+        self.reason, self.fault, self._look_again = "", "", True
         if not self._stopping:
             self._order("resume")
         self._wake.set()
@@ -261,18 +268,53 @@ class Supervisor:
         async with asyncio.TaskGroup() as tasks:
             health = tasks.create_task(self._watch_health())
             while not self._closing:
-                job = None if self.reason else self.store.next()
-                if job is None:
-                    self._wake.clear()
-                    await self._wake.wait()
-                    continue
                 try:
-                    await self._work_on(job)
-                except DiskFull as err:
-                    # Too full to note the job's end: it stays as it is, for when there is room.
-                    self.reason, self.fault = f"{err.message}: {err.hint}", type(err).__name__
-                    self._rest()
+                    job = None if self.reason else self.store.next()
+                    if job is None:
+                        self._wake.clear()
+                        await self._wake.wait()
+                    else:
+                        await self._work_on(job)
+                except BusyError:
+                    await asyncio.sleep(_LOCKED)
+                except Exception as err:
+                    self._give_in(err)
             health.cancel()
+
+    def _give_in(self, err: Exception) -> None:
+        """Rest because of an error that every job would meet; the job's end may not be noted, it stays as it is."""
+        if not isinstance(err, TofError):
+            traceback.print_exception(err)
+        said = err.message if isinstance(err, TofError) else f"{type(err).__name__}: {err}"
+        self.reason, self.fault = ": ".join(filter(None, [said, getattr(err, "hint", "")])), type(err).__name__
+        self._rest()
+        self._say("log", text=self.reason)
+
+    def _root_trouble(self, job: Job) -> str:
+        """Say why a job must not be begun: the root, or its recording, is not the folder that it was."""
+        root, again = self.settings.root, self._look_again
+        now, self._look_again = identity_of(root), False
+        lacking = [name for name in sorted(self._begun) if not (root / name).is_dir()]
+        if again and now is not None and not lacking:
+            self._root = now  # a person has looked, and what was begun is there
+        what = "put it back or mount it, then resume; or cancel the job and ask anew"
+        if now != self._root:
+            return f"{root} is not the folder that it was: moved, deleted or unmounted: {what}"
+        if job.recording in lacking:
+            return f"{root / job.recording} is not there any more: {what}"
+        return ""
+
+    async def _note(self, number: int, state: str, reason: str = "") -> None:
+        """Put a job into another state, however long another process holds the database."""
+        while True:
+            try:
+                self.store.move(number, state, reason)
+            except BusyError:
+                if self._closing:
+                    return  # it is left as running, which the next daemon puts back
+                await asyncio.sleep(_LOCKED)
+            else:
+                return
 
     async def close(self) -> None:
         """Stop the arm, let the view in hand be sealed or rolled back, and end; the job stays in the queue."""
@@ -289,7 +331,11 @@ class Supervisor:
 
     async def _work_on(self, job: Job) -> None:
         """Run recorders on a job until its end is decided."""
-        self.store.move(job.id, "running")
+        if trouble := await asyncio.to_thread(self._root_trouble, job):
+            self.reason, self.fault = trouble, "FolderGone"
+            self._tell_state()
+            return
+        await self._note(job.id, "running")
         self._busy = True
         self.progress.begin(job.id)
         self._tell_state()
@@ -307,7 +353,7 @@ class Supervisor:
             self.counters["restarts"] += 1
             self._say("log", text=f"the recorder died; started again ({crashes})")
             await asyncio.sleep(_BACKOFF[crashes - 1])
-        self._decide(job, last)
+        await self._decide(job, last)
         self._rest()
         self._tell_state()
 
@@ -327,39 +373,45 @@ class Supervisor:
         if self._stopping or self._closing:
             self._order("stop")
         last: dict[str, Any] = {}
-        async for message in self._recorder.messages():
-            if message["kind"] in _ENDS:
-                last = message
-            else:
-                self._hear(message)
-        await self._recorder.end()
-        self._recorder = None
+        try:
+            async for message in self._recorder.messages():
+                if message["kind"] in _ENDS:
+                    last = message
+                else:
+                    self._hear(message, job.recording)
+        finally:
+            if not last:
+                self._recorder.kill()
+            await self._recorder.end()
+            self._recorder = None
         return last
 
-    def _hear(self, message: dict[str, Any]) -> None:
+    def _hear(self, message: dict[str, Any], recording: str) -> None:
         self.progress.hear(message)
         kind = message.pop("kind")
         self.counters[kind] += 1
+        if kind == "planned":
+            self._begun.add(recording)
         if kind == "sealed":
             message["preview"] = self.counters["sealed"]
         self._say(kind, job=self.progress.job, progress=self.progress.counts(), **message)
 
-    def _decide(self, job: Job, last: Mapping[str, Any]) -> None:
-        """Put the job where it belongs after its recorder ended."""
+    async def _decide(self, job: Job, last: Mapping[str, Any]) -> None:
+        """Put the job where it belongs after its recorder ended: ``failed`` is only for what is its own fault."""
         kind = last.get("kind", "died")
         if kind == "done":
             state = "failed" if last["failed"] else "done"
-            self.store.move(job.id, state, "; ".join(last["reasons"]))
+            await self._note(job.id, state, "; ".join(last["reasons"]))
         elif self._closing:
-            self.store.move(job.id, "queued")
+            await self._note(job.id, "queued")
         elif self._stopping or kind == "stopped":
-            self.store.move(job.id, "stopped", _STOPPED)
+            await self._note(job.id, "stopped", _STOPPED)
             self.reason = self.reason or _STOPPED
-        elif kind == "error" and not last["lifted"]:
-            self.store.move(job.id, "failed", last["message"])
+        elif kind == "error" and last["own"]:
+            await self._note(job.id, "failed", last["message"])
         else:
             reason = " - ".join(filter(None, [last.get("message"), last.get("hint")]))
-            self.store.move(job.id, "queued")
+            await self._note(job.id, "queued")
             if not self.reason:
                 self.reason = reason or "the recorder died: look at the station, then resume"
                 self.fault = last.get("cause", "Died")
@@ -430,9 +482,9 @@ class Supervisor:
         self._say("state", state=self.snapshot())
 
     def _say(self, kind: str, **data: object) -> None:
-        """Keep and publish an event; a full disk is no reason to fall silent."""
+        """Keep and publish an event; a disk that does not take it is no reason to fall silent."""
         try:
             event = self.store.remember(kind, data)
-        except DiskFull:
+        except TofError:
             event = Event(0, utc_now(), kind, data)
         self._publish(event)

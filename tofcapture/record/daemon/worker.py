@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 
 from tofcapture.colours import NO_VALUE, palette, png_bytes, scale_for
 from tofcapture.devices import Operator
-from tofcapture.errors import BusyError, DeviceError, TofError
+from tofcapture.errors import DeviceError, TofError
 from tofcapture.files.seal import replacing
 from tofcapture.frames import View
 from tofcapture.ops.phase import Decoder
 from tofcapture.record.daemon.settings import PICTURES
+from tofcapture.record.journal import JobRefused
 from tofcapture.record.observer import Observer, Stopped
-from tofcapture.record.resources import DiskFull, check_motion_allowed
+from tofcapture.record.resources import check_motion_allowed
 from tofcapture.record.stopping import stoppable
 
 if TYPE_CHECKING:
@@ -218,12 +219,12 @@ def _work(job: Mapping[str, Any], link: DaemonLink) -> dict[str, Any]:
 
 
 def _error(err: BaseException) -> dict[str, Any]:
-    """Tell of an error: the words, and whether a person can lift what caused it."""
+    """Tell of an error: the words, and whether it is the job's own; everything else the next job would meet as well."""
     return {
         "message": err.message if isinstance(err, TofError) else f"{type(err).__name__}: {err}",
         "hint": getattr(err, "hint", ""),
         "cause": type(err).__name__,
-        "lifted": isinstance(err, (DeviceError, BusyError, DiskFull)),
+        "own": isinstance(err, JobRefused),
     }
 
 

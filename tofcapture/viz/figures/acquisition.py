@@ -19,7 +19,16 @@ from tofcapture.rig import Rig
 from tofcapture.viz.page import STEREO, TOF, draw_rig, frustum
 from tofcapture.viz.sheet import FONT, SMALL, WIDTH, Cell, draw_bar, draw_cell
 from tofcapture.viz.shots import Shot, scales_of
-from tofcapture.viz.sources import arm_of, links_of, number_of, pick_view, rig_of, scene_views, view_shot
+from tofcapture.viz.sources import (
+    arm_of,
+    links_of,
+    number_of,
+    pick_view,
+    rig_of,
+    scene_views,
+    scenes_of,
+    view_shot,
+)
 
 _HEIGHT, _HEAD = 4.9, 0.5  # inches
 _LEFT, _GAP = 5.35, 0.06  # inches: where panels begin, and between them
@@ -42,7 +51,7 @@ def draw_acquisition(figure: Any, path: Path, scene: str | None, view: int | Non
     chosen = pick_view(path, scene, view)
     paths = scene_views(path, chosen.parent.name)
     rig, arm = rig_of(path, chosen), arm_of(path)
-    board = sorted(chosen.parent.parent.glob(f"{BOARD_SCENE}/view-*.h5"))[:1]
+    board = scenes_of(path).get(BOARD_SCENE, [])[:1]
     shown = [chosen, *(board if chosen.parent.name != BOARD_SCENE else [])]
     shots = [view_shot(read_view(p), rig) for p in shown]
     words = f"{chosen.parent.name}: {len(paths)} arm poses; view {number_of(chosen)} in black"
