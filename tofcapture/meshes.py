@@ -7,6 +7,7 @@ ours because light between surfaces depends on where triangles lie: others would
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -66,7 +67,20 @@ def read_mesh(path: Path, unit: str) -> Mesh:
         raise ConfigError(f"{path}: cannot be read as a triangle mesh: {err}") from err
     if len(triangles) == 0:
         raise ConfigError(f"{path}: expected a triangle mesh, found no triangles")
+    _expect_whole(path, vertices, triangles)
     return vertices, triangles
+
+
+def _expect_whole(path: Path, vertices: Float64, triangles: Index) -> None:
+    """Refuse a mesh whose file was cut short: less than its header promises, or corners that are not there."""
+    head = path.read_bytes()[:4096].partition(b"end_header")[0] if path.suffix.lower() == ".ply" else b""
+    promised = {name.decode(): int(n) for name, n in re.findall(rb"element (vertex|face) (\d+)", head)}
+    found = {"vertex": len(vertices), "face": len(triangles)}
+    short = [f"{n} of element {name}, found {found[name]}" for name, n in promised.items() if found[name] < n]
+    if not np.isfinite(vertices).all() or int(triangles.max()) >= len(vertices) or triangles.min() < 0:
+        short.append("finite corners for every triangle")
+    if short:
+        raise ConfigError(f"{path}: cut short or damaged: expected {', '.join(short)}", hint="copy it again")
 
 
 def extrude(outer: Float64, height: float, holes: Sequence[Float64] = ()) -> Mesh:

@@ -215,13 +215,8 @@ def check_memory() -> Iterator[Finding]:
         yield graded("shared memory", f"{free / 1e6:.0f} MB free", advice)
 
 
-def check_surroundings() -> Iterator[Finding]:
-    """Look at what users without a home or with another locale lack."""
-    from tofcapture.libraries import keeps_kernels
-
-    advice = "set NUMBA_CACHE_DIR to a folder of yours: each command now compiles anew, for up to a minute"
-    kept = keeps_kernels()
-    yield graded("compiled code", "can be kept" if kept else "cannot be kept", "" if kept else advice)
+def check_locale() -> Iterator[Finding]:
+    """Look at how names of files and what is printed are encoded."""
     names, out = sys.getfilesystemencoding(), sys.stdout.encoding
     advice = "" if names == "utf-8" else "set LC_ALL=C.UTF-8: names of files beyond ASCII are shown escaped"
     yield graded("locale", f"file names in {names}, output in {out}", advice)
@@ -300,7 +295,7 @@ def _run(args: argparse.Namespace) -> Outcome:
     alone: tuple[Examination, ...] = (
         check_clock,
         check_memory,
-        check_surroundings,
+        check_locale,
         check_ports,
         check_daemon,
     )

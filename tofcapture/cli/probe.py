@@ -106,6 +106,15 @@ def probe_open3d() -> Iterator[Finding]:
     yield attempt("open3d", lambda: f"{load_open3d().__version__}, loads", "FAIL" if there else "WARN")
 
 
+def probe_kernels() -> Iterator[Finding]:
+    """Look whether machine code can be kept; a user without a home folder may have no place for it."""
+    from tofcapture.libraries import keeps_kernels
+
+    kept = keeps_kernels()
+    advice = "set NUMBA_CACHE_DIR to a folder of yours: each command now compiles anew, for up to a minute"
+    yield graded("compiled code", "can be kept" if kept else "cannot be kept", "" if kept else advice)
+
+
 def probe_nxlib() -> Iterator[Finding]:
     """Load the Ensenso client, and the SDK behind it."""
     found = _import("nxlib", ("nxlib",), "ensenso", "Ensenso cameras")
@@ -222,6 +231,7 @@ PROBES: dict[str, Callable[..., Iterator[Finding]]] = {
     "open3d": probe_open3d,
     "ur-rtde": lambda: iter([_import("ur-rtde", _RTDE, "ur", _UR_ARMS)]),
     "nxlib": probe_nxlib,
+    "compiled code": probe_kernels,
     "drivers": probe_drivers,
     "commands": probe_commands,
     "station": probe_station,

@@ -14,7 +14,6 @@ from tofcapture.errors import ConfigError, TofError
 from tofcapture.files.layout import VIEW
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
 from tofcapture.ops.phase import Decoder
-from tofcapture.poses import Float64
 
 _MODULATION = (1e5, 1e9)  # Hz
 _EXPOSURE = (1e-7, 0.1)  # s
@@ -23,7 +22,6 @@ _DEPTH = (0.02, 20.0)  # m; the median of a scene
 _FAR_SHARE = 0.005  # of the points may be wild
 _REACH = 5.0  # m; from an arm's base to its flange
 _TURNS = 6.5  # rad; more than a turn: no joint of these arms goes there
-_OFF = np.radians(1.0)  # rad; a settled arm is much closer
 _CLOCKS = 3600 * 10**9  # ns; devices that tell monotonic time are much closer
 
 
@@ -144,8 +142,8 @@ def check_points(frame: Any, info: StereoInfo) -> None:
     )
 
 
-def check_state(state: Any, goal: Float64 | None = None) -> None:
-    """Refuse an arm's state that cannot be in radians and metres; ``goal`` (6,) is where it was sent."""
+def check_state(state: Any) -> None:
+    """Refuse an arm's state that cannot be in radians and metres."""
     require(isinstance(state, ArmState), "[arm] state() returns an ArmState", type(state), "another object")
     joints = np.asarray(state.joints, dtype=np.float64)
     whole = joints.shape == (6,) and bool(np.isfinite(joints).all())
@@ -156,9 +154,3 @@ def check_state(state: Any, goal: Float64 | None = None) -> None:
     require(away < _REACH, "[arm] T_base_flange is in metres", f"{away:g}", "the driver gives millimetres")
     whole = isinstance(state.time_ns, int)
     require(whole, "[arm] time_ns is a whole number", repr(state.time_ns), "seconds as floats")
-    if goal is not None:
-        off = float(np.abs(joints - goal).max())
-        cause = "the driver gives degrees, another order of joints, or an earlier state"
-        require(
-            off < _OFF, "[arm] move_to returns the state at the goal", f"{np.degrees(off):.3g} deg off", cause
-        )

@@ -174,16 +174,16 @@ class Database:
         try:
             with full_disk_named(self.path):
                 yield
-        except sqlite3.Error as err:
+        except (sqlite3.Error, ValueError) as err:  # a garbled message is no text
             raise _no_damage(self.path, err) or self.damaged(err) from err
 
 
 def _look_over(db: sqlite3.Connection) -> None:
-    if (said := db.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
+    if (said := db.execute("PRAGMA integrity_check(1)").fetchone()[0]) != "ok":
         raise sqlite3.DatabaseError(said)
 
 
-def _no_damage(path: Path, err: sqlite3.Error) -> TofError | None:
+def _no_damage(path: Path, err: Exception) -> TofError | None:
     """Name an error that no damage causes."""
     if "locked" in str(err):
         return BusyError(f"{path}: another process holds it", hint="let it end, then run the same again")
@@ -210,7 +210,7 @@ def read_rows(path: Path, sql: str, what: str, hint: str) -> list[Any]:
             return _rows((Path(name) / path.name).as_uri(), sql)
     except OSError as err:
         raise UnreadableError(f"{path}: cannot be read just now: {err.strerror}", hint=_WHOLE) from err
-    except sqlite3.Error as err:
+    except (sqlite3.Error, ValueError) as err:
         damage = DamagedError(f"{path}: not {what}, or damaged: {err}", hint=hint)
         raise _no_damage(path, err) or damage from err
 

@@ -205,7 +205,7 @@ class _Run:
         state = self.station.arm.state()
         for joints in route(model, self.station.rig, workcell, state.joints, planned.joints):
             state = self.station.arm.move_to(joints)
-            check_state(state, joints)
+            check_state(state)
         return state
 
     def expose(self, planned: PlannedView) -> tuple[TofBurst, StereoFrame, ArmState]:

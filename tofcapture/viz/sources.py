@@ -256,4 +256,7 @@ def _ply_points(path: Path) -> NDArray[np.float32]:
     names = [line.split()[-1] for line in head.splitlines() if line.startswith(b"property float ")]
     if not mark or names[:3] != [b"x", b"y", b"z"]:
         raise ValueError(f"{path.name} is no binary PLY with x, y, z first")
-    return np.frombuffer(body, "<f4").reshape(-1, len(names))[:, :3]
+    points = np.frombuffer(body, "<f4").reshape(-1, len(names))[:, :3]
+    if f"element vertex {len(points)}\n".encode() not in head:
+        raise ValueError(f"{path.name} holds {len(points)} points, fewer or more than it says")
+    return points
