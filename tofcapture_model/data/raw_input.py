@@ -342,7 +342,9 @@ def _from_h5(path: Path, view: int) -> RawInput:
     except UnreadableError:
         raise
     except DataError as err:
-        raise DataError(err.message, hint=err.hint if path.suffix == ".h5" else _KINDS) from err
+        raise DataError(
+            f"cannot read the file: {err.message}", hint=err.hint if path.suffix == ".h5" else _KINDS
+        ) from err
     if kind != "tofcapture-shard":
         found = read_view(path)
         return RawInput(found.tof.raw, found.tof.celsius, found.tof.info, found.rig.tof, str(path))

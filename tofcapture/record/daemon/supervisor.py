@@ -286,7 +286,10 @@ class Supervisor:
         if not isinstance(err, TofError):
             traceback.print_exception(err)
         said = err.message if isinstance(err, TofError) else f"{type(err).__name__}: {err}"
-        self.reason, self.fault = ": ".join(filter(None, [said, getattr(err, "hint", "")])), type(err).__name__
+        self.reason, self.fault = (
+            ": ".join(filter(None, [said, getattr(err, "hint", "")])),
+            type(err).__name__,
+        )
         self._rest()
         self._say("log", text=self.reason)
 
