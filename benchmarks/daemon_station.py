@@ -3,7 +3,9 @@
     python benchmarks/daemon_station.py daemon ROOT STATE [--http 127.0.0.1:0] [--station arrays | FILE.toml]
 
 The worker's environment: ``BENCH_DELAY`` seconds per device step, ``BENCH_LOG`` a file that gets a line per move and stop of the arm,
-``BENCH_FULL`` a file: while it exists, the disk is full from the write on whose number stands in it;
+``BENCH_FULL`` a file: while it exists, the disk refuses from the write on whose number stands in it, as full or with the errno after it;
+``BENCH_STATE`` the same for the daemon's own database;
+``BENCH_FAULT`` a file: while it exists, devices have the fault that it names (:data:`FAULTS`);
 ``BENCH_ASKS`` set: a person must confirm the scene; ``BENCH_HOST`` set: the arm has a driver host; ``BENCH_LARGE`` set: images of full size;
 ``BENCH_REAL`` set: the arm is a real one; ``BENCH_HOLD`` a file: while it exists, the device step whose number stands in it waits, until
 the arm is stopped. The daemon's: ``BENCH_LOST`` seconds of silence after which a recorder is killed,
@@ -63,6 +65,9 @@ board_normal = [-0.258819, 0.0, 0.965926]
 """
 
 
+FAULTS = ("error", "unexpected", "stopped", "millimetres", "zeros", "closed")  # of devices
+
+
 class _Arrays:
     """Arm, cameras and operator in one: what a camera sees hangs on the pose alone."""
 
@@ -79,6 +84,23 @@ class _Arrays:
         a, b = (10, 40) if "BENCH_LARGE" in os.environ else (1, 1)
         self.tof = Camera(24, 18, 20.0, 20.0, 11.5, 8.5).scaled(a)
         self.stereo = Camera(32, 24, 30.0, 30.0, 15.5, 11.5).scaled(b)
+
+    def fault(self) -> str:
+        """Name the fault of the devices, empty when they work; raise those that raise."""
+        try:
+            fault = Path(os.environ["BENCH_FAULT"]).read_text(encoding="ascii")
+        except (KeyError, OSError):
+            return ""
+        from tofcapture.devices.faults import ProtectiveStop
+        from tofcapture.errors import DeviceError
+
+        if fault == "stopped":
+            raise ProtectiveStop("the controller reports: protective stop")
+        if fault == "error":
+            raise DeviceError("the camera does not answer")
+        if fault == "unexpected":
+            raise LookupError("VENDOR_STATUS_17")
+        return fault
 
     def step(self) -> None:
         time.sleep(float(os.environ.get("BENCH_DELAY", "0")))
@@ -139,12 +161,16 @@ class _Role:
     def capture(self, frames: int | None = None) -> Any:
         from tofcapture.frames import StereoFrame, TofBurst
 
-        np, rng = self.bench.np, self.bench.rng(self.role)
+        np, rng, fault = self.bench.np, self.bench.rng(self.role), self.bench.fault()
         self.bench.step()
         if self.role == "tof":
             raw = rng.integers(0, 4096, (frames, 8, *self.bench.tof.shape)).astype(np.uint16)
             return TofBurst(raw, np.arange(frames), np.full(frames, 40.0), self.describe())
         points = rng.uniform(0.4, 1.0, (*self.bench.stereo.shape, 3)).astype(np.float32)
+        if fault == "millimetres":
+            points *= 1000
+        if fault == "zeros":
+            points[:4] = 0
         return StereoFrame(points, 2, self.describe())
 
     def place(self, scene: str) -> None:
@@ -159,11 +185,14 @@ def _open_arrays(path: Path | None = None, seed: int | None = None, allow_motion
     import numpy as np
 
     from tofcapture.devices.station import Station, read_station
+    from tofcapture.errors import DeviceError
     from tofcapture.poses import transform
     from tofcapture.rig import Rig
 
     del path, allow_motion
     config, bench = read_station(None, seed), _Arrays()
+    if bench.fault() == "closed":
+        raise DeviceError("1 of 4 devices do not open: tof: the port is gone")
     _Role.simulated = "BENCH_REAL" not in os.environ
     places = transform(np.eye(3), [-0.05, 0.08, 0.0]), transform(np.eye(3), [0.0, -0.035, 0.08])
     station = Station(
@@ -236,34 +265,51 @@ def _with_host(open_real: Callable[..., Any]) -> Callable[..., Any]:
     return opened
 
 
+def _refusal(flag: Path) -> Callable[[], int]:
+    """Count writes; tell the errno that each meets, 0 for none."""
+    count = itertools.count(1)
+
+    def refused() -> int:
+        number = next(count)
+        try:
+            first, _, name = flag.read_text(encoding="ascii").partition(" ")
+            return getattr(errno, name or "ENOSPC") if number >= int(first or 1) else 0
+        except (OSError, ValueError):
+            return 0
+
+    return refused
+
+
+def _fill_database(refused: Callable[[], int]) -> None:
+    """Make writes to SQLite fail in its own words."""
+    from tofcapture.files.disk import Database
+
+    words = {errno.ENOSPC: "database or disk is full", errno.EROFS: "attempt to write a readonly database"}
+
+    def refuse(real: Callable[..., Any]) -> Callable[..., Any]:
+        def write(self: Any, sql: str, *values: Any) -> Any:
+            with self._named():
+                if not sql.startswith(("SELECT", "PRAGMA")) and (number := refused()):
+                    raise sqlite3.OperationalError(words.get(number, "disk I/O error"))
+            return real(self, sql, *values)
+
+        return write
+
+    Database.do, Database.insert = refuse(Database.do), refuse(Database.insert)
+
+
 def _fill_disk(flag: Path) -> None:
     """Make every kind of write fail, from the one on that the flag file names, for as long as it exists."""
     import h5py
 
     from tofcapture.files import view
-    from tofcapture.record.journal import Journal
 
-    count = itertools.count(1)
-
-    def full() -> bool:
-        number = next(count)
-        try:
-            return number >= int(flag.read_text(encoding="ascii") or 1)
-        except (OSError, ValueError):
-            return False
+    refused = _refusal(flag)
 
     def refuse(real: Callable[..., Any]) -> Callable[..., Any]:
         def write(*args: Any, **more: Any) -> Any:
-            if full():
-                raise OSError(errno.ENOSPC, "No space left on device")
-            return real(*args, **more)
-
-        return write
-
-    def refuse_row(real: Callable[..., Any]) -> Callable[..., Any]:
-        def write(*args: Any, **more: Any) -> Any:
-            if full():
-                raise sqlite3.OperationalError("database or disk is full")
+            if number := refused():
+                raise OSError(number, os.strerror(number))
             return real(*args, **more)
 
         return write
@@ -271,7 +317,7 @@ def _fill_disk(flag: Path) -> None:
     view.create, view.write_attrs = refuse(view.create), refuse(view.write_attrs)
     os.fsync, Path.write_text = refuse(os.fsync), refuse(Path.write_text)
     h5py.File.close = refuse(h5py.File.close)
-    Journal._set = refuse_row(Journal._set)  # noqa: SLF001
+    _fill_database(refused)
 
 
 def _few_candidates() -> None:
@@ -315,6 +361,8 @@ def daemon(args: argparse.Namespace) -> None:
     from tofcapture.record.daemon.settings import Settings, open_folder
 
     _scope()
+    if flag := os.environ.get("BENCH_STATE"):
+        _fill_database(_refusal(Path(flag)))
     guard.IDLE = float(os.environ.get("BENCH_IDLE", guard.IDLE))
     args.root.mkdir(parents=True, exist_ok=True)
     toml = None if args.station == "arrays" else Path(args.station)

@@ -334,10 +334,6 @@ class Supervisor:
 
     async def _work_on(self, job: Job) -> None:
         """Run recorders on a job until its end is decided."""
-        if trouble := await asyncio.to_thread(self._root_trouble, job):
-            self.reason, self.fault = trouble, "FolderGone"
-            self._tell_state()
-            return
         await self._note(job.id, "running")
         self._busy = True
         self.progress.begin(job.id)
@@ -362,6 +358,8 @@ class Supervisor:
 
     async def _record(self, job: Job) -> dict[str, Any]:
         """Run one recorder; return its last message, empty when it died."""
+        if trouble := await asyncio.to_thread(self._root_trouble, job):
+            return {"kind": "error", "own": False, "message": trouble, "cause": "FolderGone"}
         settings = self.settings
         told = {
             **asdict(job),
