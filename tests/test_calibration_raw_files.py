@@ -36,7 +36,7 @@ def test_real_imperfections_do_not_hide_the_order(tmp_path, seed):
     """Vignetted frames with dead pixels, fixed pattern and metadata rows are read and their order is found."""
     raw, hz, theta = frames(seed)
     np.save(tmp_path / "raw.npy", spoilt(raw, seed))
-    back = read_raw(tmp_path / "raw.npy", 8)
+    back = read_raw(tmp_path / "raw.npy", [8])
     assert back.shape[-2] == SHAPE[0]
     assert same(find_phase_order(back, HZ), hz, theta)
 
@@ -59,7 +59,7 @@ def test_every_form_is_the_same_frames(tmp_path):
         cv2.imwrite(str(folder / f"frame{i}.png"), image)
     (tmp_path / "words.raw").write_bytes(raw.astype(">u2").tobytes())
     for name in ("big.npy", "last.npy", "turns.npy", "some.npz", "some.h5", "images", "words.raw"):
-        found = read_raw(tmp_path / name, 8, SHAPE)
+        found = read_raw(tmp_path / name, [8], SHAPE)
         assert found.dtype.isnative
         np.testing.assert_array_equal(found, raw, err_msg=name)
 
@@ -70,7 +70,7 @@ def test_signs_in_twelve_bits_come_back(tmp_path):
     stored = (np.rint(raw).astype(np.int64) & 0xFFF).astype(np.uint16)
     np.testing.assert_array_equal(signed(stored), np.rint(raw))
     np.save(tmp_path / "raw.npy", stored)
-    assert same(find_phase_order(read_raw(tmp_path / "raw.npy", 4), (30e6,)), hz, theta)
+    assert same(find_phase_order(read_raw(tmp_path / "raw.npy", [4]), (30e6,)), hz, theta)
 
 
 def test_an_image_without_metadata_is_whole():
@@ -106,11 +106,11 @@ def broken(tmp_path):
     colours = np.stack([grey, grey, 255 - grey], axis=-1)
     return {
         "none.npy": (DataError, "no such file"),
-        "seven.npy": (DataError, "multiple of 8"),
+        "seven.npy": (DataError, "K of 8"),
         "words.npy": (FormatError, "numbers"),
         "pickled.npy": (FormatError, "npy"),
         "two.npz": (FormatError, "one array"),
-        "flat.h5": (FormatError, "none"),
+        "flat.h5": (FormatError, "one a channel"),
         "cut.h5": (FormatError, "HDF5"),
         "words.raw": (FormatError, "size"),
         "page.pdf": (FormatError, r"\.pdf"),
@@ -125,7 +125,7 @@ def test_what_is_no_raw_has_a_name(tmp_path):
     """Missing and damaged files, words, other counts of images, two arrays, colours and files without a size each say so."""
     for name, (kind, says) in broken(tmp_path).items():
         with pytest.raises(kind, match=says) as caught:
-            read_raw(tmp_path / name, 8)
+            read_raw(tmp_path / name, [8])
         assert name in str(caught.value)
     with pytest.raises(FormatError, match="multiple"):
-        read_raw(tmp_path / "words.raw", 8, SHAPE)
+        read_raw(tmp_path / "words.raw", [8], SHAPE)

@@ -391,10 +391,13 @@ def configure_phase_order(parser: argparse.ArgumentParser) -> None:
         "raw",
         type=Path,
         metavar="RAW",
-        help="(frames, K, H, W) or (K, H, W), K = 4 per frequency: .npy, .npz, .h5, .raw, or a folder of images, one phase each",
+        help="(frames, K, H, W) or (K, H, W): .npy, .npz, .h5, .raw, or a folder of images, one phase each",
     )
     parser.add_argument(
         "--mhz", default="20,100", metavar="F[,F]", help="modulation frequencies in MHz (default: 20,100)"
+    )
+    parser.add_argument(
+        "--phases", metavar="N[,N]", help="phases of each frequency (default: shared out evenly)"
     )
     parser.add_argument(
         "--reference",
@@ -415,7 +418,11 @@ def run_phase_order(args: argparse.Namespace) -> Outcome:
     reference = None if args.reference is None else _array(args.reference)
     size = args.shape and _listed("--shape", args.shape, int, "H,W such as 180,240", 2)
     shape = (size[0], size[1]) if size else None
-    order = find_phase_order(read_raw(args.raw, 4 * len(hz), shape), hz, reference)
+    phases = args.phases and _listed("--phases", args.phases, int, "whole numbers such as 4,3")
+    phases = phases and (phases if len(phases) > 1 else phases * len(hz))
+    # Four phases are the usual: a folder of twelve images at one frequency is three frames of them.
+    counts = [sum(phases)] if phases else [n * len(hz) for n in (4, 3, 5, 6, 2)]
+    order = find_phase_order(read_raw(args.raw, counts, shape), hz, reference, phases)
     data = {"format": "tofcapture-phase-order", "version": 1, **asdict(order)}
     data["offset_rad"] = [None if np.isnan(x) else x for x in order.offset_rad]  # NaN is not JSON
     return kit.written(data, _order_table(order), args.out)
@@ -427,11 +434,14 @@ def _order_table(order: PhaseOrder) -> str:
     lines = [
         kit.table(("channel", "MHz", "phase deg"), rows),
         f"sign from {order.sign_from}, confidence {order.confidence:.2f}",
-        f"second harmonic {order.second_harmonic:.3f}, concentration {order.concentration:.3f}",
+        f"other harmonics {order.harmonics:.3f}, concentration {order.concentration:.3f}",
     ]
+    if order.blocks_from != "data":
+        lines.append("look: which channels are of which near frequency is taken from the order of --mhz")
     if not order.start_known:
         lines.append(
-            "look: the start tap is assumed; ranges hold up to a quarter period, pass --reference to settle it"
+            "look: where the phases start is not known: the first channel of each frequency is taken for 0, ranges hold up to a constant; "
+            "pass --reference to settle it"
         )
     return "\n".join(lines)
 

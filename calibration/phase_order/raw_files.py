@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,12 @@ NAMES = ("raw", "frames", "taps", "data")  # of the array that is meant where a 
 HEADER_ROWS = 4  # at most so many rows of an image are metadata
 
 
-def read_raw(path: Path, channels: int, shape: tuple[int, int] | None = None) -> NDArray[Any]:
+def read_raw(path: Path, counts: Sequence[int], shape: tuple[int, int] | None = None) -> NDArray[Any]:
     """Read raw frames.
 
-    ``path`` is ``.npy``, ``.npz`` or ``.h5`` (the one array of 3 or more axes in it), a folder of images or of binary files, or one
-    binary file. ``channels`` are the phase images of one frame, 4 per frequency. ``shape`` (H, W) is that of binary files, which do not say.
+    ``path`` is ``.npy``, ``.npz`` or ``.h5`` (the one array of 3 or more axes in it, or one array a channel in the order of their names),
+    a folder of images or of binary files, or one binary file. ``counts`` are the numbers of phase images that one frame may have, the first
+    that fits. ``shape`` (H, W) is that of binary files, which do not say.
 
     Returns (frames, K, H, W), native byte order, rows of metadata taken off.
 
@@ -42,7 +44,7 @@ def read_raw(path: Path, channels: int, shape: tuple[int, int] | None = None) ->
         raise FormatError(
             f"{path}: expected .npy, .npz, .h5, .raw, .bin or a folder of images, got {suffix!r}"
         )
-    return without_metadata(_framed(found, channels, str(path)))
+    return without_metadata(_framed(found, counts, str(path)))
 
 
 def _numpy(path: Path) -> NDArray[Any]:
@@ -71,21 +73,31 @@ def _hdf5(path: Path) -> NDArray[Any]:
 
 
 def _only(arrays: dict[str, Any], path: Path) -> Any:
-    """The array called raw, or the only one with images in it."""
-    images = {k: v for k, v in arrays.items() if v.ndim >= 3}
-    chosen = {k: v for k, v in images.items() if k.rsplit("/", 1)[-1].lower() in NAMES} or images
-    if len(chosen) != 1:
+    """The array called raw, or the only one with images in it, or all where each is a channel."""
+    images = {k: v for k, v in arrays.items() if v.ndim >= 2 and min(v.shape[-2:]) > 1}
+    whole = {k: v for k, v in images.items() if v.ndim >= 3}
+    chosen = {k: v for k, v in whole.items() if k.rsplit("/", 1)[-1].lower() in NAMES} or whole or images
+    if whole and len(chosen) == 1:
+        return next(iter(chosen.values()))
+    shapes = {(v.shape, v.dtype.kind) for v in images.values()}
+    if len(shapes) != 1 or len(images) < 2 or next(iter(images.values())).ndim > 3:
         raise FormatError(
-            f"{path}: expected one array of images, got {', '.join(f'{k} {v.shape}' for k, v in chosen.items()) or 'none'}",
+            f"{path}: expected one array of images, or one a channel, all of one shape, got "
+            f"{', '.join(f'{k} {v.shape}' for k, v in images.items()) or 'none'}",
             hint="call it raw, or save it alone as .npy",
         )
-    return next(iter(chosen.values()))
+    return np.stack([np.asarray(images[k][...]) for k in sorted(images, key=_natural)], axis=-3)
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Order names with numbers in them by the numbers."""
+    return [(int(t), "") if t.isdigit() else (-1, t) for t in re.split(r"(\d+)", name)]
 
 
 def _folder(path: Path, shape: tuple[int, int] | None) -> NDArray[Any]:
     """Images in the natural order of their names, one phase each."""
     files = [p for p in path.iterdir() if p.suffix.lower() in (*IMAGES, *BINARY)]
-    files.sort(key=lambda p: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", p.name)])
+    files.sort(key=lambda p: _natural(p.name))
     if not files:
         raise DataError(
             f"{path}: expected images ({', '.join(IMAGES)}) or binary files ({', '.join(BINARY)}), found none"
@@ -132,27 +144,43 @@ def _roughness(images: NDArray[Any]) -> float:
     return float(np.median(np.abs(np.diff(rows, axis=-1)))) / max(float(np.std(rows)), 1e-9)
 
 
-def _framed(raw: NDArray[Any], channels: int, where: str) -> NDArray[Any]:
+def _framed(raw: NDArray[Any], counts: Sequence[int], where: str) -> NDArray[Any]:
     """Bring (N, H, W), (K, H, W), (N, K, H, W) and channels-last arrays into signed (frames, K, H, W)."""
     if raw.dtype.kind not in "iuf":
         raise FormatError(f"{where}: expected numbers, got {raw.dtype}")
     raw = raw.astype(raw.dtype.newbyteorder("="), copy=False)
     if raw.ndim == 5 and 1 in raw.shape[:2]:
         raw = raw.reshape(raw.shape[0] * raw.shape[1], *raw.shape[2:])
+    for read in (_as_frames, _as_turns, _as_images):
+        for channels in counts:
+            found = read(raw, channels)
+            if found is not None and len(found):
+                return signed(found)
+    raise DataError(
+        f"{where}: expected (frames, K, H, W), or a multiple of K images, K of {', '.join(map(str, counts))}, got shape {raw.shape}",
+        hint="--mhz says how many frequencies there are, --phases how many phase images each has",
+    )
+
+
+def _as_frames(raw: NDArray[Any], channels: int) -> NDArray[Any] | None:
+    if raw.ndim == 3:
+        raw = raw[None]
     if raw.ndim == 4 and raw.shape[1] != channels and raw.shape[-1] == channels:
         raw = np.moveaxis(raw, -1, 1)
+    return raw if raw.ndim == 4 and raw.shape[1] == channels else None
+
+
+def _as_turns(raw: NDArray[Any], channels: int) -> NDArray[Any] | None:
+    """Two frequencies that take turns from frame to frame."""
     if raw.ndim == 4 and 2 * raw.shape[1] == channels and len(raw) % 2 == 0:
-        raw = raw.reshape(-1, channels, *raw.shape[2:])  # the frequencies take turns from frame to frame
-    if raw.ndim == 3 and raw.shape[0] % channels and raw.shape[-1] == channels:
-        raw = np.moveaxis(raw, -1, 0)
-    if raw.ndim == 3 and len(raw) and len(raw) % channels == 0:
-        raw = raw.reshape(-1, channels, *raw.shape[1:])
-    if raw.ndim != 4 or raw.shape[1] != channels or not len(raw):
-        raise DataError(
-            f"{where}: expected (frames, {channels}, H, W) or a multiple of {channels} images, got shape {raw.shape}",
-            hint="--mhz says how many frequencies there are: 4 phase images each",
-        )
-    return signed(raw)
+        return raw.reshape(-1, channels, *raw.shape[2:])
+    return None
+
+
+def _as_images(raw: NDArray[Any], channels: int) -> NDArray[Any] | None:
+    if raw.ndim == 3 and len(raw) % channels == 0:
+        return raw.reshape(-1, channels, *raw.shape[1:])
+    return None
 
 
 def signed(raw: NDArray[Any]) -> NDArray[Any]:
