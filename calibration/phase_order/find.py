@@ -215,8 +215,10 @@ def _pairings(taps: Float64, counts: Sequence[int]) -> tuple[list[tuple[Block, .
         for own in split:
             known[own] = known.get(own) or judge.best(own)
         apart = judge.offsets(split) if min(counts) == 3 and len(counts) > 1 else 0.0
-        for orders in product(*(known[own][:3] for own in split)):
-            readings.append((np.sqrt(max(apart, *(o[0] for o in orders))), tuple(o[1] for o in orders)))
+        readings += [
+            (np.sqrt(max(apart, *(left for left, _ in orders))), tuple(o for _, o in orders))
+            for orders in product(*(known[own][:3] for own in split))
+        ]
     readings.sort()
     best = float(readings[0][0])
     # Blocks of one exposure share B, so pairs may be exchanged between blocks: those ties are for later.
