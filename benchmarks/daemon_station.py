@@ -10,7 +10,7 @@ The worker's environment: ``BENCH_DELAY`` seconds per device step, ``BENCH_LOG``
 ``BENCH_REAL`` set: the arm is a real one; ``BENCH_HOLD`` a file: while it exists, the device step whose number stands in it waits, until
 the arm is stopped. The daemon's: ``BENCH_LOST`` seconds of silence after which a recorder is killed,
 ``BENCH_IDLE`` seconds that a connection may take. ``BENCH_SCOPE`` names what ``tofcapture stop`` of a test stops.
-``BENCH_REAL`` with ``BENCH_MOVES``: the daemon was started with --allow-motion.
+``BENCH_PROTECT`` a file: while it exists, the arm is in protective stop. ``BENCH_REAL`` with ``BENCH_MOVES``: the daemon was started with --allow-motion.
 """
 
 from __future__ import annotations
@@ -145,6 +145,10 @@ class _Role:
 
     def move_to(self, joints: Any) -> Any:
         self._note("move")
+        if Path(os.environ.get("BENCH_PROTECT", "/nowhere")).exists():
+            from tofcapture.devices.faults import ProtectiveStop
+
+            raise ProtectiveStop("the arm is in protective stop")
         self.bench.step()
         self.bench.joints = self.bench.np.array(joints)
         return self.state()

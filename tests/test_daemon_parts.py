@@ -195,7 +195,7 @@ def test_the_pace_is_that_of_the_recorder_at_work(monkeypatch):
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     plan = {"kind": "planned", "views": [{"index": i, "state": "planned"} for i in range(6)]}
     sealed = {"kind": "sealed", "quality": {}, "sha256": "x"}
-    progress.begin(1)
+    progress.begin(1, ("r", "mug"))
     for seconds, message in (
         *(
             (0, plan),

@@ -6,6 +6,7 @@ import os
 import resource
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -97,6 +98,22 @@ def test_the_daemon_and_its_recorder_are_stopped(tmp_path, scope, capsys, queue)
             state = daemon.wait(lambda s: s["phase"] == "paused")
             assert (state["job"]["state"], state["reason"]) == ("stopped", "stopped by the operator")
         until(lambda: len([c for c in stopping._channels() if not c.foreign()]) <= 1)
+
+
+def test_the_api_stops_while_the_queue_is_locked(tmp_path, scope):
+    """Another process holds the database: the arm does not wait for it, and the answer says that it was heard."""
+    log, hold = tmp_path / "log", tmp_path / "hold"
+    hold.write_text("4")
+    with running(tmp_path, BENCH_SCOPE=scope, BENCH_LOG=log, BENCH_HOLD=hold) as daemon:
+        daemon.record(5)
+        daemon.wait(lambda s: s["progress"]["sealed"] == 1)
+        with sqlite3.connect(daemon.state / "queue.sqlite", isolation_level=None) as other:
+            other.execute("BEGIN EXCLUSIVE")
+            assert daemon.ask("POST", "/v1/stop")["reason"] == "stopped by the operator"
+            until(lambda: "stop" in log.read_text())
+            other.execute("ROLLBACK")
+        other.close()
+        assert daemon.wait(lambda s: s["phase"] == "paused")["job"]["state"] == "stopped"
 
 
 def test_what_does_not_answer_is_killed(tmp_path, scope, capsys):

@@ -27,6 +27,7 @@ PAGE_FILES = {
     "/": ("index.html", "text/html"),
     "/app.js": ("app.js", "text/javascript"),
     "/picture.js": ("picture.js", "text/javascript"),
+    "/words.js": ("words.js", "text/javascript"),
     "/style.css": ("style.css", "text/css"),
 }
 

@@ -97,6 +97,7 @@ class Progress:
 
     def __init__(self) -> None:
         self.job: int | None = None
+        self._scene = ("", "")
         self.views: dict[int, dict[str, Any]] = {}
         self.doing: dict[str, Any] | None = None
         self.asks: str | None = None
@@ -106,10 +107,10 @@ class Progress:
         self.sealed_now = 0
         self._since, self._sealed_then = 0.0, 0  # when the recorder at work began, and what was sealed before
 
-    def begin(self, job: int) -> None:
-        """Forget the job before; a job that goes on after a crash keeps its table until the new plan comes."""
-        if job != self.job:
-            self.views = {}
+    def begin(self, job: int, scene: tuple[str, str]) -> None:
+        """Forget the job before; of the same (recording, scene) the table stays until the new plan comes."""
+        if scene != self._scene:
+            self.views, self._scene = {}, scene
         self.end()
         self.job, self.sealed_now = job, 0
 
@@ -124,7 +125,9 @@ class Progress:
             self.simulated = bool(message["simulated"])
         elif kind == "planned":
             # What was measured of a view before the recorder was started anew still holds.
-            self.views = {v["index"]: {**self.views.get(v["index"], {}), **v} for v in message["views"]}
+            self.views = {
+                v["index"]: {**self.views.get(v["index"], {}), "reason": "", **v} for v in message["views"]
+            }
             self._since, self._sealed_then = time.monotonic(), self.sealed_now
         elif kind == "step" and message["step"] != "failed":
             self.doing = {"index": message["index"], "step": message["step"]}
@@ -172,6 +175,7 @@ class Supervisor:
         self._root = identity_of(settings.root)
         self._begun: set[str] = set()  # recordings, by this daemon
         self._look_again = False
+        self._stored: dict[str, Any] = {"job": None, "queue": {}, "last_event": 0}
         self.reason, self.fault = "", ""  # why it rests; the kind of error, where one is why
         if settings.station is None:
             self.progress.simulated = True
@@ -336,7 +340,7 @@ class Supervisor:
         """Run recorders on a job until its end is decided."""
         await self._note(job.id, "running")
         self._busy = True
-        self.progress.begin(job.id)
+        self.progress.begin(job.id, (job.recording, job.scene))
         self._tell_state()
         crashes = 0
         while True:
@@ -413,9 +417,9 @@ class Supervisor:
         else:
             reason = " - ".join(filter(None, [last.get("message"), last.get("hint")]))
             await self._note(job.id, "queued")
-            if not self.reason:
-                self.reason = reason or "the recorder died: look at the station, then resume"
-                self.fault = last.get("cause", "Died")
+            # Also when it was to rest anyway: a person must know.
+            self.reason = reason or "the recorder died: look at the station, then resume"
+            self.fault = last.get("cause", "Died")
 
     @property
     def phase(self) -> str:
@@ -432,8 +436,16 @@ class Supervisor:
 
     def snapshot(self) -> dict[str, Any]:
         """Tell everything but the table of views, as JSON types."""
-        progress, store = self.progress, self.store
+        progress = self.progress
+        # Another process holds the database, or it is damaged: nobody waits for it, least of all a stop.
+        with contextlib.suppress(TofError):
+            self._stored = {
+                "job": asdict(self.store.job(progress.job)) if progress.job is not None else None,
+                "queue": self.store.counts(),
+                "last_event": self.store.last_event(),
+            }
         return {
+            **self._stored,
             "version": __version__,
             "pid": os.getpid(),
             "started_utc": self._started,
@@ -445,14 +457,11 @@ class Supervisor:
             "simulated": progress.simulated,
             "root": str(self.settings.root),
             "station": str(self.settings.station or "simulated"),
-            "job": asdict(store.job(progress.job)) if progress.job is not None else None,
             "progress": progress.counts(),
             "doing": progress.doing,
             "asks": progress.asks,
-            "queue": store.counts(),
             "preview": self.counters["sealed"],
             "scales": progress.scales,
-            "last_event": store.last_event(),
             "health": self._health(),
         }
 

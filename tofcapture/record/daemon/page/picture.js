@@ -24,3 +24,14 @@ export function drawPlan(svg, views, nowIndex) {
   }
   svg.replaceChildren(...nodes);
 }
+
+// A strip of colours from low to high, with five numbers and their unit below.
+export function drawScale(node, scale) {
+  node.hidden = !scale;
+  if (!scale) return;
+  const strip = document.createElement("div");
+  strip.style.background = `linear-gradient(90deg, ${scale.colours.map((c) => `rgb(${c.join(" ")})`).join(", ")})`;
+  const numbers = scale.ticks.map((text) => Object.assign(document.createElement("span"), { textContent: text }));
+  numbers.at(-1).textContent += ` ${scale.unit}`;
+  node.replaceChildren(strip, ...numbers);
+}
