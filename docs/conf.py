@@ -37,6 +37,8 @@ nitpicky = False
 # Words such as "depth" are attributes of many classes; where the reference offers them all, none is meant more than the others.
 suppress_warnings = ["ref.python"]
 
+smartquotes = False  # a command with its quotes can be copied
+
 html_theme = "furo"
 html_title = f"tofcapture {release}"
 html_static_path = []

@@ -7,6 +7,7 @@ control.
 from __future__ import annotations
 
 import argparse
+import ast
 import importlib.util
 import os
 import re
@@ -83,21 +84,34 @@ def _documented(path: Path) -> bool:
 
 
 def api_pages() -> dict[str, str]:
-    """``reference/api-*.md``, one a package, and their index."""
+    """``reference/api-*.md``: an index of each package, with the first line of each module, and a page a module."""
     pages = {}
     for package, names in modules().items():
-        parts = [f"# `{package}`\n\nPublic names of every module, from their docstrings.\n"]
-        parts += [
-            f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n```\n" for name in names
-        ]
-        pages[f"api-{package}.md"] = "\n".join(parts)
+        lines = [f"# `{package}`", "", "| module | what it does |", "|---|---|"]
+        lines += [f"| [{name}](api/{name}.md) | {_first_line(name)} |" for name in names]
+        lines += ["", "```{toctree}", ":hidden:", "", *(f"api/{name}" for name in names), "```", ""]
+        pages[f"api-{package}.md"] = "\n".join(lines)
+        for name in names:
+            body = f"```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n```\n"
+            pages[f"api/{name}.md"] = f"# {name}\n\n{body}"
     return pages
+
+
+def _first_line(module: str) -> str:
+    path = ROOT / module.replace(".", "/")
+    path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    return text.partition("\n")[0].replace("``", "`").replace("|", "\\|")
 
 
 def write_all(folder: Path) -> None:
     """Write all generated pages; one whose text is the same is left alone, so that Sphinx need not read it again."""
-    folder.mkdir(exist_ok=True)
-    for name, text in {"commands.md": commands_page(), **api_pages()}.items():
+    (folder / "api").mkdir(parents=True, exist_ok=True)
+    pages = {"commands.md": commands_page(), **api_pages()}
+    for old in folder.rglob("*.md"):
+        if str(old.relative_to(folder)) not in pages:
+            old.unlink()
+    for name, text in pages.items():
         path = folder / name
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")

@@ -49,13 +49,6 @@ def test_every_command_has_help_and_an_example_that_parses(name):
     parser({name: command}).parse_args(words[1:])
 
 
-def test_every_command_stands_in_the_readme():
-    """README shows each command once at least."""
-    text = (ROOT / "README.md").read_text()
-    for name in COMMANDS:
-        assert re.search(rf"(tofcapture|make) {name}\b", text), name
-
-
 @pytest.mark.parametrize(
     ("words", "code"),
     [
