@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tofcapture.cli.kit import Command, Outcome, progress
+from tofcapture.cli.kit import Command, Outcome, counted, progress
 from tofcapture.errors import ConfigError, TofError
 from tofcapture_model.config import Config, load_config, preset, presets
 from tofcapture_model.evaluation.tables import SUITES
@@ -133,7 +133,7 @@ def _train(args: argparse.Namespace) -> Outcome:
         )
     data = {"weights": str(done.path), "steps": done.steps, "finished": done.finished, "losses": done.losses}
     following = f"tofcapture evaluate {args.dataset[0]} --weights {args.out}"
-    return Outcome(data, f"{done.path}: trained for {done.steps} steps\n  next: {following}")
+    return Outcome(data, f"{done.path}: trained for {counted(done.steps, 'step')}", following=following)
 
 
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
@@ -187,7 +187,10 @@ def _evaluate(args: argparse.Namespace) -> Outcome:
             device=_checked_device(args.device),
             progress=lambda done, total: report("evaluate", done, total),
         )
-    return Outcome({**results, "results": str(args.out)}, f"{comparison(results)}\n{args.out}")
+    following = f"tofcapture report --dataset {args.dataset} --results {args.out}"
+    return Outcome(
+        {**results, "results": str(args.out)}, f"{comparison(results)}\n{args.out}", following=following
+    )
 
 
 def _one_network(weights: Sequence[str] | None) -> Path | None:
@@ -277,7 +280,7 @@ def _predict(args: argparse.Namespace) -> Outcome:
     )
     if result["warning"]:
         print(f"tofcapture: {result['warning']}", file=sys.stderr)
-    return Outcome(result, _told(result, args.out, args.device))
+    return Outcome(result, _told(result, args.out, args.device), following=f"tofcapture view {args.out}")
 
 
 def _told(result: dict[str, Any], out: Path, device: str) -> str:

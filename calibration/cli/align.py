@@ -66,7 +66,8 @@ def _run(args: argparse.Namespace) -> Outcome:
         "drift": None if moved is None else drift_table(moved),
     }
     lines = [table(evidence), *([] if moved is None else [drift_text(moved)])]
-    return Outcome(data=data, text="\n".join([*lines, *paths.values(), page or absent]))
+    following = f"tofcapture build-dataset {args.recording} --out dataset"
+    return Outcome(data, "\n".join([*lines, *paths.values(), page or absent]), following=following)
 
 
 def _page(

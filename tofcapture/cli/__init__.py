@@ -221,7 +221,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _failed("Missing", f"the library {err.name} is missing", hint, 3, as_json=as_json)
         hint = "set TOFCAPTURE_TRACEBACK=1 to see where"
         return _failed(type(err).__name__, str(err), hint, 1, as_json=as_json)
-    _tell(json.dumps(outcome.data, allow_nan=False, default=str) if as_json else outcome.text)
+    told = f"\n  next: {outcome.following}" if outcome.following and outcome.exit_code == 0 else ""
+    _tell(json.dumps(outcome.data, allow_nan=False, default=str) if as_json else outcome.text + told)
     return outcome.exit_code
 
 

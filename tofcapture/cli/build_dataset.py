@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tofcapture.cli.kit import Command, Outcome, progress
+from tofcapture.cli.kit import Command, Outcome, counted, progress
 from tofcapture.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -107,19 +107,21 @@ def _outcome(result: BuildResult, seconds: float, *, complete: bool) -> Outcome:
         "seconds": round(seconds, 2),
     }
     bad = result.failures or (complete and result.missing)
-    return Outcome(data, _text(result, views, seconds), exit_code=5 if bad else 0)
+    following = f"tofcapture train {result.dataset} --out run"
+    return Outcome(data, _text(result, views, seconds), 5 if bad else 0, following)
 
 
 def _text(result: BuildResult, views: int, seconds: float) -> str:
     lines = [
-        f"{name:<24} {entry.split:<6} {entry.views:>3} views" for name, entry in sorted(result.scenes.items())
+        f"{name:<24} {entry.split:<6} {counted(entry.views, 'view')}"
+        for name, entry in sorted(result.scenes.items())
     ]
     lines.append(
-        f"{result.dataset}: {len(result.scenes)} scenes, {views} views in {seconds:.1f} s, "
+        f"{result.dataset}: {counted(len(result.scenes), 'scene')}, {counted(views, 'view')} in {seconds:.1f} s, "
         f"at most {result.peak_memory / 2**30:.2f} GiB a process"
     )
     if result.skipped:
-        lines.append(f"{len(result.skipped)} scenes were already built")
+        lines.append(f"{counted(len(result.skipped), 'scene')} already built")
     if result.gt is not None:
         gt = result.gt
         lines.append(

@@ -6,7 +6,7 @@ import argparse
 import time
 from pathlib import Path
 
-from tofcapture.cli.kit import Command, Outcome, progress
+from tofcapture.cli.kit import Command, Outcome, counted, progress
 from tofcapture.errors import ConfigError
 
 
@@ -24,18 +24,20 @@ def _check(args: argparse.Namespace) -> Outcome:
             f"{path}: expected a file or folder, found nothing there", hint="tofcapture check PATH"
         )
     total = sum(1 for _ in path.rglob("*.h5")) or 1
-    counted: list[Path] = []
+    files: list[Path] = []
     with progress() as report:
 
         def tell(file: Path) -> None:
-            report("check", len(counted), total, str(file))
-            counted.append(file)
+            report("check", len(files), total, str(file))
+            files.append(file)
 
         problems = check(path, tell)
     rows = [{"path": str(p.path), "where": p.where, "message": p.message, "hint": p.hint} for p in problems]
     lines = [line for p in problems for line in (str(p), f"  try: {p.hint}" if p.hint else "") if line]
-    lines.append(f"{path}: {len(counted)} files, {f'{len(problems)} problems' if problems else 'ok'}")
-    data = {"path": str(path), "ok": not problems, "files": len(counted), "problems": rows}
+    lines.append(
+        f"{path}: {counted(len(files), 'file')}, {counted(len(problems), 'problem') if problems else 'ok'}"
+    )
+    data = {"path": str(path), "ok": not problems, "files": len(files), "problems": rows}
     return Outcome(data, "\n".join(lines), exit_code=5 if problems else 0)
 
 
@@ -63,8 +65,8 @@ def _pack(args: argparse.Namespace) -> Outcome:
         scenes = pack(args.dataset, args.split, args.out, tell)
     size = sum(scene.path.stat().st_size for scene in scenes.values())
     data = {"cache": str(args.out), "scenes": len(scenes), "views": total, "packed": done, "bytes": size}
-    text = f"{args.out}: {total} views of {len(scenes)} scenes, {size / 1e9:.2f} GB, {done} views packed now"
-    return Outcome(data, text)
+    text = f"{args.out}: {counted(total, 'view')} of {counted(len(scenes), 'scene')}, {size / 1e9:.2f} GB, {done} packed now"
+    return Outcome(data, text, following=f"tofcapture train {args.dataset} --cache {args.out} --out run")
 
 
 def _configure_export(parser: argparse.ArgumentParser) -> None:
@@ -104,8 +106,8 @@ def _export(args: argparse.Namespace) -> Outcome:
         "seconds": seconds,
     }
     text = (
-        f"{args.out}: {result.files} files of {len(result.scenes)} scenes, {result.size / 1e6:.2f} MB; "
-        f"{len(result.written)} scenes written in {seconds:.1f} s"
+        f"{args.out}: {counted(result.files, 'file')} of {counted(len(result.scenes), 'scene')}, {result.size / 1e6:.2f} MB; "
+        f"{len(result.written)} written in {seconds:.1f} s"
     )
     return Outcome(data, text)
 

@@ -25,6 +25,7 @@ class Outcome:
     data: dict[str, Any] = field(default_factory=dict)
     text: str = ""  #: What a person reads on stdout without ``--json``.
     exit_code: int = 0  #: 0 unless the command succeeded in finding something wrong (``check``).
+    following: str = ""  #: The command that usually comes next, told after a success.
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,11 @@ def time_left(seconds: float, fresh: float, left: float) -> str:
         return "time left unknown"
     need = seconds * left / fresh
     return f"{need / 60:.0f} min left" if need > 90 else f"{need:.0f} s left"
+
+
+def counted(number: int, thing: str) -> str:
+    """Say how many there are of a thing: 1 view, 2 views."""
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]], indent: str = "") -> str:

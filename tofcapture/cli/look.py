@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tofcapture.cli.kit import Command, Outcome, progress, table
+from tofcapture.cli.kit import Command, Outcome, counted, progress, table
 from tofcapture.errors import UsageError
 
 if TYPE_CHECKING:
@@ -110,7 +110,9 @@ def _stats(args: argparse.Namespace) -> Outcome:
         (TABLES["outliers"], outlier_rows(stats, 10)),
     )
     text = "\n\n".join(table(header, rows) for header, rows in tables if rows)
-    text += f"\n\n{args.dataset}: {len(stats.views)} views, {len(stats.outliers)} numbers stand out"
+    text += (
+        f"\n\n{args.dataset}: {counted(len(stats.views), 'view')}, {len(stats.outliers)} numbers stand out"
+    )
     if args.html is not None:
         data["page"] = str(write_stats_page(stats, args.html))
         text += f"\n{args.html}: {args.html.stat().st_size / 1e6:.2f} MB"

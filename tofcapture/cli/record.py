@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tofcapture.cli.kit import Command, Outcome, progress, table
+from tofcapture.cli.kit import Command, Outcome, counted, progress, table
 from tofcapture.cli.setup import station_path
 from tofcapture.record.observer import Observer
 
@@ -151,18 +151,24 @@ def _plan_table(plan: Plan) -> str:
 
 
 def _recorded(recording: Path, result: RecordResult) -> Outcome:
+    from tofcapture.frames import CALIBRATION
+
     taken, kept, plan = len(result.recorded), len(result.kept), result.plan
     lines = [*result.repaired, *result.reasons, *result.notes]
     if taken or result.failed:
         failed = f"{len(result.failed)} failed: {recording}"
-        lines.append(f"{taken} views of {result.scene!r} recorded, {kept} were there, {failed}")
+        lines.append(f"{counted(taken, 'view')} of {result.scene!r} recorded, {kept} there before, {failed}")
     else:
-        lines.append(f"nothing to record: {kept} views of {result.scene!r} are there")
+        lines.append(f"nothing to record: all {counted(kept, 'view')} of {result.scene!r} are there")
     lines += plan.shortfall()
     data = {key: value for key, value in vars(result).items() if key != "plan"}
     planned = {"digest": plan.digest, "views": len(plan.views), "wanted": plan.wanted}
     data |= {"ok": not result.failed, "recording": str(recording), "plan": planned}
-    return Outcome(data=data, text="\n".join(lines), exit_code=4 if result.failed else 0)
+    board = result.scene == CALIBRATION
+    following = (
+        f"tofcapture align {recording}" if board else f"tofcapture build-dataset {recording} --out dataset"
+    )
+    return Outcome(data, "\n".join(lines), 4 if result.failed else 0, following)
 
 
 COMMAND = Command(

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tofcapture.cli.kit import Command, Outcome, progress
+from tofcapture.cli.kit import Command, Outcome, counted, progress
 
 if TYPE_CHECKING:
     from tofcapture.suites.run import Simulated
@@ -106,7 +106,7 @@ def _run_dataset(args: argparse.Namespace) -> Outcome:
             spec, args.out, args.jobs, lambda done, total: report("views", done, total), args.split
         )
     data = _data(result)
-    return Outcome(data=data, text=_text(data))
+    return Outcome(data, _text(data), following=f"tofcapture train {args.out} --out run")
 
 
 def _data(result: Simulated) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def _data(result: Simulated) -> dict[str, Any]:
 
 def _text(data: dict[str, Any]) -> str:
     lines = [
-        f"{data['dataset']}: {data['scenes']} scenes, {data['views']} views, {data['bytes'] / 1e9:.2f} GB in {data['seconds']:.0f} s"
+        f"{data['dataset']}: {counted(data['scenes'], 'scene')}, {counted(data['views'], 'view')}, {data['bytes'] / 1e9:.2f} GB in {data['seconds']:.0f} s"
     ]
     if data["kept"]:
         lines.append(f"{len(data['kept'])} scenes were there already")
