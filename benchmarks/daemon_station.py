@@ -143,6 +143,14 @@ class _Role:
 
         return ArmState(self.bench.joints.copy(), forward(MODELS["ur10e"], self.bench.joints), 1)
 
+    def kinematics(self) -> Any:
+        from tofcapture.devices.kinematics import MODELS
+
+        return MODELS["ur10e"]
+
+    def check_move(self, start: Any, goal: Any) -> None:
+        del start, goal
+
     def move_to(self, joints: Any) -> Any:
         self._note("move")
         if Path(os.environ.get("BENCH_PROTECT", "/nowhere")).exists():
@@ -241,7 +249,9 @@ class _Followed:
 
     def __init__(self, hosted: Any, arm: Any) -> None:
         self._hosted, self._arm = hosted, arm
-        self.describe, self.state = arm.describe, arm.state
+        self.describe, self.state, self.kinematics, self.check_move = (
+            arm.describe, arm.state, arm.kinematics, arm.check_move,
+        )  # fmt: skip
 
     def move_to(self, joints: Any) -> Any:
         self._hosted.move_to(joints)

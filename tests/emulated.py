@@ -11,6 +11,7 @@ STATION = """
 driver = "ur_rtde"
 host = "{host}"
 speed = 1.0
+camera_speed = 1.5
 acceleration = 1.4
 settle = 0.05
 {more}

@@ -14,6 +14,8 @@ import pytest
 from tofcapture.camera import Camera
 from tofcapture.devices import Arm, StereoDevice, TofCamera
 from tofcapture.devices.console import ConsoleOperator
+from tofcapture.devices.faults import StopLatch
+from tofcapture.devices.kinematics import MODELS, forward
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.sim.drivers import DRIVERS as SIM
 from tofcapture.errors import DeviceError, MotionRefused
@@ -181,7 +183,7 @@ class _Arm(Arm):
     off = 0.0
 
     def __init__(self):
-        self.joints, self.open = np.zeros(6), False
+        self.joints, self.open, self.latch = np.zeros(6), False, StopLatch()
 
     def __enter__(self):
         self.open = True
@@ -197,16 +199,20 @@ class _Arm(Arm):
         if not self.open:
             raise DeviceError("closed")
         _Arm.clock += 1
-        return ArmState(self.joints.copy(), np.eye(4), _Arm.clock)
+        return ArmState(self.joints.copy(), forward(MODELS["ur10e"], self.joints), _Arm.clock)
 
     def move_to(self, joints):
+        self.latch.check(self.latch.token)
         if np.shape(joints) != (6,) or not np.all(np.abs(joints) < 7):
             raise MotionRefused("no")
         self.joints = np.asarray(joints) + self.off
         return self.state()
 
     def stop(self):
-        return None
+        self.latch.stop()
+
+    def resume(self):
+        self.latch.resume(self.latch.token)
 
 
 class _Inexact(_Arm):

@@ -76,6 +76,12 @@ class Role:
     def __getattr__(self, name):
         return getattr(self._bench, name)
 
+    def kinematics(self):
+        return MODELS["ur5e"]
+
+    def check_move(self, start, goal):
+        pass
+
 
 def bench_station():
     bench = Bench()

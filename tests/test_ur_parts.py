@@ -1,6 +1,8 @@
 """The parts of the UR driver and of its emulator that need no library: wire, settings, codes, way, probe, motion."""
 
+import socket
 import struct
+import threading
 import tomllib
 from contextlib import nullcontext
 from dataclasses import replace
@@ -10,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests import until
 from tests.ur_emulator.faults import STAGES, Faults
 from tests.ur_emulator.motion import Motion
 from tests.ur_emulator.process import Emulator
@@ -17,12 +20,12 @@ from tests.ur_emulator.robot import PLAYING, Robot
 from tests.ur_emulator.rtde_server import pack
 from tests.ur_emulator.script import ControlScript
 from tofcapture.devices import faults
-from tofcapture.devices.clearance import body_points, workcell_of
+from tofcapture.devices.clearance import body_of, workcell_of
 from tofcapture.devices.kinematics import HOME
 from tofcapture.devices.station import DEFAULT, open_station
 from tofcapture.devices.ur_rtde import link as wire
 from tofcapture.devices.ur_rtde import probe as probing
-from tofcapture.devices.ur_rtde.limits import check_goal, check_way, read_settings
+from tofcapture.devices.ur_rtde.limits import check_goal, check_way, joint_speed, read_settings
 from tofcapture.devices.ur_rtde.link import danger, halted
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 
@@ -86,6 +89,8 @@ def test_nonsense_on_the_wire_is_refused():
         ({"host": "h", "speed": "fast"}, "speed"),
         ({"host": "h", "model": "ur99"}, "ur99"),
         ({"host": "h", "pose": "guess"}, "pose"),
+        ({"host": "h", "controller_limits": "off"}, "ask or ignore"),
+        ({"host": "h", "camera_speed": 3.0}, "camera_speed"),
         ({"host": "h", "workspace": [[0, 0, 0], [1, 1, -1]]}, "workspace"),
         ({"host": "h", "keep_out": [[0, 0, 0], [1, 1, 1]]}, "keep_out"),
     ],
@@ -150,8 +155,8 @@ def test_ways_are_checked():
     with pytest.raises(MotionRefused, match="keep_out 1"):
         check_way(post, rig, stage, start, across)
     # Links and cameras have a girth: a box beside the flange is too close.
-    flange = body_points(SETTINGS.model, rig, HOME)[1][0]
-    for gap, refusal in ((0.07, pytest.raises(MotionRefused, match="keep_out 1")), (0.5, nullcontext())):
+    flange = body_of(SETTINGS.model, rig, stage, HOME).flange
+    for gap, refusal in ((0.05, pytest.raises(MotionRefused, match="keep_out 1")), (0.5, nullcontext())):
         corner = flange + np.array([gap, 0.0, 0.0])
         beside = replace(SETTINGS, keep_out=np.array([[corner, corner + 0.002]]))
         with refusal:
@@ -299,3 +304,42 @@ def test_probe_refuses_what_is_not_ready(emulator):
         emulator.order("lift")
     with pytest.raises(faults.ControllerSilent, match="30004"):
         probing.probe(read_settings({"host": "127.250.0.9"}))
+
+
+def test_no_camera_is_faster_than_allowed():
+    """Flange and cameras keep to their speed in m/s wherever a motion takes them, and no joint exceeds its own in rad/s."""
+    with open_station() as station:
+        rig = station.rig
+    stage, rng = workcell_of(tomllib.loads(DEFAULT.read_text())), np.random.default_rng(3)
+    reached = []
+    for goal in HOME + rng.uniform(-1.5, 1.5, (12, 6)):
+        speed = joint_speed(SETTINGS, rig, stage, HOME, goal)
+        assert 0.05 < speed <= SETTINGS.speed
+        # The joint with the longest way goes at this speed, the others in proportion: a thousandth of the way at a time.
+        way = np.linspace(HOME, goal, 1001)
+        places = body_of(SETTINGS.model, rig, stage, way).cameras
+        seconds = np.abs(goal - HOME).max() / 1000 / speed
+        fastest = np.linalg.norm(np.diff(places, axis=0), axis=-1).max() / seconds
+        assert fastest <= SETTINGS.camera_speed
+        reached.append(max(fastest / SETTINGS.camera_speed, speed / SETTINGS.speed))
+    assert min(reached) > 0.95  # and is not slower than it must be
+    alone = _turned(6, 1.0)
+    assert joint_speed(SETTINGS, rig, stage, HOME, alone) == SETTINGS.speed
+
+
+@pytest.mark.parametrize(
+    ("start", "ended"), [(b"def another():\n  while True:\n  end\nend\n", False), (None, True)]
+)
+def test_a_program_of_somebody_else_is_left_alone(emulator, start, ended):
+    """A program that runs on the controller is NotReady, before anything is sent; one of ours that is about to end is waited for."""
+    emulator.order("lift")
+    with socket.create_connection((emulator.host, 30003)) as link:
+        link.sendall(start or b"def rtde_control():\n  pass\nend\n")
+        until(lambda: emulator.order("status")["runtime"] == PLAYING)
+        timer = threading.Timer(0.5, lambda: emulator.order("script_death") if ended else None)
+        timer.start()
+        with nullcontext() if ended else pytest.raises(faults.NotReady, match="another program runs"):
+            _ask(emulator)
+        timer.join()
+        assert (emulator.order("status")["runtime"] == PLAYING) is not ended
+    emulator.order("lift")

@@ -7,6 +7,7 @@
     ├── ConfigError          3             a TOML file, an option or a value is wrong
     ├── DeviceError          4             a device is missing, silent or refuses
     │   └── MotionRefused    4             the arm must not or cannot go there
+    │       └── MotionStopped                somebody told it to stop
     ├── DataError            5             a file is missing, damaged, foreign, or says something impossible
     │   ├── FormatError      5             a file's layout is not the one its version promises
     │   └── UnreadableError  5             a file cannot be read just now (lock, permission, disk); that is no damage
@@ -50,6 +51,10 @@ class DeviceError(TofError):
 
 class MotionRefused(DeviceError):  # noqa: N818  the arm's answer is a refusal, not a fault
     """The arm must not, or cannot, go there."""
+
+
+class MotionStopped(MotionRefused):
+    """Somebody told the arm to stop, and nobody has said since that it may go on."""
 
 
 class DataError(TofError):

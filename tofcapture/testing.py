@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofcapture.devices.contract import check_burst, check_points, check_state, check_tof_info
+from tofcapture.devices.kinematics import ArmModel, pose_error
 from tofcapture.devices.registry import lacking
 from tofcapture.errors import ConfigError, MotionRefused, TofError
 from tofcapture.frames import ArmInfo, ArmState, StereoInfo, TofInfo, Truth
@@ -48,24 +49,32 @@ class _Watched(threading.local):
 _watched = _Watched()
 
 
-def check_arm(make: Make, prepare: Prepare = lambda _: None, goal: ArrayLike | None = None) -> None:
+def check_arm(
+    make: Make,
+    prepare: Prepare = lambda _: None,
+    goal: ArrayLike | None = None,
+    kinematics: ArmModel | None = None,
+) -> None:
     """Put an arm through the contract.
 
-    It moves: by 0.02 rad in its first joint, or to ``goal`` (6,) rad, reachable from where it stands, and back.
+    It moves: by 0.02 rad in its first joint, or to ``goal`` (6,) rad, reachable from where it stands, and back. ``kinematics``
+    are those of the station's ``[arm.kinematics]``, for a driver that brings none.
     """
     arm = _made(make, "arm")
     _check_describe(arm, ArmInfo)
+    model = _kinematics(arm) if kinematics is None else kinematics
     _refuses(arm.state, TofError, "state() of an arm that is not open raises a TofError")
     with arm as opened:
         prepare(opened)
         _require(opened is arm, "__enter__ returns the device")
         before = _check_state(arm)
+        wrong = pose_error(model, before.joints, before.T_base_flange)
+        _require(not wrong, "the kinematics lead from the measured joints to the measured pose", wrong)
         there = before.joints + np.eye(6)[0] * _NUDGE if goal is None else np.asarray(goal, dtype=np.float64)
+        arm.check_move(before.joints, there)
         _check_moves(arm, before.joints, there)
         _check_refusals(arm)
-        arm.stop()
-        arm.stop()
-        _check_state(arm)
+        _check_stop(arm, there, before.joints)
     arm.stop()
     _refuses(arm.state, TofError, "state() of a closed arm raises a TofError")
     with make() as again:
@@ -215,6 +224,31 @@ def _check_moves(arm: Any, home: Float64, goal: Float64) -> None:
         _require(off < _NEAR, "move_to returns the measured state, settled at the goal", off)
         now = arm.state()
         _require(np.abs(now.joints - state.joints).max() < _NEAR, "after move_to the arm stays where it is")
+
+
+def _kinematics(arm: Any) -> ArmModel:
+    clause = "kinematics() gives the arm's geometry before opening (dh_model, urdf_model), or the station has [arm.kinematics]"
+    try:
+        model = arm.kinematics()
+    except TofError as err:
+        raise ContractError(f"{clause}; it raised {err.message}") from err
+    _require(isinstance(model, ArmModel), clause, model)
+    checked: ArmModel = model
+    return checked
+
+
+def _check_stop(arm: Any, goal: Float64, home: Float64) -> None:
+    """A stop holds until somebody resumes, as often as it comes."""
+    for _ in range(2):
+        arm.stop()
+        arm.stop()
+        before = _check_state(arm).joints
+        for _ in range(2):
+            clause = "after stop() move_to raises MotionRefused, each time, until resume()"
+            _refuses(partial(arm.move_to, goal), MotionRefused, clause)
+        _require(np.abs(arm.state().joints - before).max() < _NEAR, "after stop() nothing moves")
+        arm.resume()
+        _check_moves(arm, home, goal)
 
 
 def _check_refusals(arm: Any) -> None:

@@ -23,12 +23,16 @@ class Faults:
     ----------
     speed
         Speed slider, 0 to 1.
+    haste
+        How many times faster than the clock the arm moves: for whole plans.
     delay
         Seconds by which every answer is late.
     frozen
         Data packages stop; the connections stay open.
     spoiled
         Joint angles are reported as NaN.
+    denies
+        Every pose is outside the safety limits.
     lacking
         Outputs that this controller does not have, as older ones do not.
     """
@@ -38,8 +42,8 @@ class Faults:
         self._clear()
 
     def _clear(self) -> None:
-        self.speed, self.delay = 1.0, 0.0
-        self.frozen = self.spoiled = False
+        self.speed, self.delay, self.haste = 1.0, 0.0, 1.0
+        self.frozen = self.spoiled = self.denies = False
         self.lacking: frozenset[str] = frozenset()
         self._silent: dict[str, int] = {}  # stage -> how many times it still answers
         self._coming: dict[str, float] = {}  # fault -> part of the move at which it comes; negative: now
@@ -87,8 +91,12 @@ class Faults:
             self.speed, self.delay = float(order.get("speed", 1.0)), float(order.get("delay", 0.0))
         elif what == "lack":
             self.lacking = frozenset(map(str, order["names"]))
+        elif what == "deny":
+            self.denies = True
+        elif what == "haste":
+            self.haste = float(order["factor"])
         elif what in TIMED:
             self._coming[what] = float(order.get("share", -1.0))
         else:
-            return f"expected do = lift, mute with a stage of {STAGES}, slow, lack or one of {TIMED}, got {order}"
+            return f"expected do = lift, mute with a stage of {STAGES}, slow, haste, lack, deny or one of {TIMED}, got {order}"
         return ""

@@ -71,7 +71,7 @@ class Robot:
         now = self._clock()
         passed, self._last = now - self._last, now
         if self.motion is not None:
-            self.motion.advance(passed, self.faults.speed)
+            self.motion.advance(passed * self.faults.haste, self.faults.speed)
             self.joints, self.velocity = self.motion.position, self.motion.velocity
             if self.motion.finished:
                 self.motion, self.velocity = None, (0.0,) * 6

@@ -107,4 +107,4 @@ def _at_rest(robot: Robot) -> bool:
 
 
 def _within(robot: Robot, joints: list[float]) -> bool:
-    return all(math.isfinite(q) and abs(q) <= robot.model.limit for q in joints)
+    return not robot.faults.denies and all(math.isfinite(q) and abs(q) <= 2 * math.pi for q in joints)

@@ -281,7 +281,7 @@ def examine(examination: Examination) -> list[Finding]:
 def _configure(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--station", type=Path, metavar="STATION.toml", help="look at its devices too, without opening them")
-    add("--open", action="store_true", help="open the station's devices as well; nothing moves")
+    add("--open", action="store_true", help="open its devices too: takes control of the arm; nothing moves")
     add("--folder", type=Path, default=Path(), metavar="DIR", help="where recordings would go (default: .)")
 
 
@@ -290,6 +290,11 @@ def _run(args: argparse.Namespace) -> Outcome:
     if not folder.is_dir():
         raise ConfigError(f"{folder}: expected a folder", hint="make it, or name another with --folder")
     station = str(station_path(args.station)[0] or "")
+    if args.open and station:
+        words = (
+            "connects to every device, and starts a program of its own on the arm's controller; nothing moves"
+        )
+        print(f"tofcapture doctor --open takes control of {station}: it {words}", file=sys.stderr, flush=True)
     quick: tuple[Examination, ...] = (check_python, check_libraries, check_wheels, check_weights)
     # The disk's speed and the clocks are measured when nothing else runs.
     alone: tuple[Examination, ...] = (

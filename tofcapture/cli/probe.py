@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture.cli.kit import Command
-from tofcapture.errors import TofError
+from tofcapture.errors import ConfigError, TofError
 
 _RTDE = ("rtde_control", "rtde_receive", "rtde_io", "dashboard_client")
 _UR_ARMS = "arms of Universal Robots (newer than Python 3.12: apt-get install cmake libboost-all-dev first)"
@@ -165,13 +165,14 @@ def probe_commands() -> Iterator[Finding]:
 def probe_station(path: str, opening: str = "") -> Iterator[Finding]:
     """Read a station's file, make its drivers, ask whether its devices are there; with ``opening`` open them too."""
     from tofcapture.devices.clearance import workcell_of
+    from tofcapture.devices.kinematics import pose_error
     from tofcapture.devices.registry import ROLES, StationContext
     from tofcapture.devices.station import open_station, read_station
 
     file = Path(path) if path else None
     try:
         config = read_station(file)
-        workcell_of(config)
+        workcell = workcell_of(config)
     except TofError as err:
         yield Finding("station", "FAIL", err.message, err.hint)
         return
@@ -179,12 +180,17 @@ def probe_station(path: str, opening: str = "") -> Iterator[Finding]:
     context = StationContext(config=config, folder=(file or Path()).resolve().parent)
     found = [finding for role in ROLES for finding in _probe_device(role, context)]
     found += _probe_rig(context)
+    if not any(f.what == "arm" and f.verdict == "FAIL" for f in found):
+        found += _probe_arm(context, workcell)
     yield from found
 
     def open_all() -> str:
         with open_station(file) as station:
-            joints = ", ".join(f"{q:.2f}" for q in station.arm.state().joints)
-            return f"all open; the arm stands at {joints} rad"
+            state = station.arm.state()
+            if wrong := pose_error(station.arm.kinematics(), state.joints, state.T_base_flange):
+                raise ConfigError(wrong, hint="correct the kinematics: every check of a way rests on them")
+            joints = ", ".join(f"{q:.2f}" for q in state.joints)
+            return f"all open; the arm stands at {joints} rad, where its kinematics have it"
 
     if opening and all(f.verdict != "FAIL" for f in found):
         yield attempt("devices", open_all)
@@ -214,6 +220,34 @@ def _probe_device(role: str, context: Any) -> Iterator[Finding]:
         return
     if there or not warned:
         yield graded(role, f"{said}; {there}" if there else said)
+
+
+def _probe_arm(context: Any, workcell: Any) -> Iterator[Finding]:
+    """See whether views can be planned for the arm: its kinematics, and a home that is clear; and what it does without."""
+    from tofcapture.devices.clearance import REASONS, obstacles
+    from tofcapture.devices.kinematics import check_joints
+    from tofcapture.devices.registry import arm_kinematics, make_device
+    from tofcapture.rig import load_rig
+
+    arm = make_device("arm", context)
+    for caution in arm.cautions():
+        yield graded("arm caution", caution, "take the setting out, unless this arm cannot do otherwise")
+
+    def home() -> str:
+        model = arm_kinematics(arm, context)
+        check_joints(model, workcell.home)
+        path = context.config.get("rig", {}).get("path")
+        rig = load_rig(context.folder / str(path)) if path else context.shared.get("rig")
+        if rig is None:
+            return f"{model.name}; whether home is clear is not known without a rig"
+        hits = obstacles(model, rig, workcell, workcell.home)
+        if met := [reason for reason, hit in zip(REASONS, hits, strict=True) if hit]:
+            raise ConfigError(
+                f"[plan] home is not clear: {', '.join(met)}", hint="choose another: six angles in radians"
+            )
+        return f"{model.name}; home is clear"
+
+    yield attempt("arm kinematics", home)
 
 
 def _probe_rig(context: Any) -> Iterator[Finding]:

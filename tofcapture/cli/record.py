@@ -10,7 +10,7 @@ import math
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tofcapture.cli.kit import Command, Outcome, counted, progress, table
 from tofcapture.cli.setup import station_path
@@ -132,10 +132,30 @@ def _planned(args: argparse.Namespace, scene: str, station: Station, plan: Plan)
     title = f"{scene}: {len(plan.views)} views, {station.arm.describe().model}"
     picture.parent.mkdir(parents=True, exist_ok=True)
     write_plan(plan, workcell, station.rig, target, title, picture)
-    return Outcome(
-        data={"ok": True, "scene": scene, "plan": plan.as_json(), "picture": str(picture)},
-        text="\n".join([plan.summary(), _plan_table(plan), *plan.shortfall(), f"drawn in {picture}"]),
-    )
+    proof = _proof(station, plan)
+    lines = [plan.summary(), _plan_table(plan), *plan.shortfall(), proof["text"], f"drawn in {picture}"]
+    data = {
+        "ok": proof["ok"],
+        "scene": scene,
+        "plan": plan.as_json(),
+        "proof": proof,
+        "picture": str(picture),
+    }
+    return Outcome(data=data, text="\n".join(lines), exit_code=0 if proof["ok"] else 4)
+
+
+def _proof(station: Station, plan: Plan) -> dict[str, Any]:
+    """Check every motion of a plan, from where the arm stands, as the arm will before it moves."""
+    from tofcapture.errors import MotionRefused
+    from tofcapture.record.plan import prove
+
+    try:
+        ways = prove(station, plan)
+    except MotionRefused as err:
+        return {"ok": False, "text": f"NOT to be recorded: {err.message}\n  try: {err.hint}"}
+    motions, by_home = sum(map(len, ways)), sum(len(way) > 1 for way in ways)
+    text = f"{motions} motions, {by_home} views by way of home, all allowed by the checks of the arm's driver"
+    return {"ok": True, "text": text, "motions": motions, "by_home": by_home}
 
 
 def _plan_table(plan: Plan) -> str:

@@ -15,6 +15,7 @@ from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBur
 from tofcapture.poses import Float64
 
 if TYPE_CHECKING:
+    from tofcapture.devices.kinematics import ArmModel
     from tofcapture.rig import Rig
 
 
@@ -72,6 +73,34 @@ class Arm(Device, Protocol):
         """Say what this arm is, without opening it."""
         ...
 
+    def kinematics(self) -> ArmModel:
+        """Give the arm's geometry, without opening it; here that of a known ``model``.
+
+        Raises
+        ------
+        ConfigError
+            It is not known: a table ``[arm.kinematics]`` of the station must give it.
+        """
+        from tofcapture.devices.kinematics import arm_model
+
+        return arm_model(self.describe().model)
+
+    def check_move(self, start: Float64, goal: Float64) -> None:
+        """Check a straight motion in joint space, (6,) to (6,) radians, as ``move_to`` will; nothing moves.
+
+        Plans are made, and dry runs proved, with it. An arm that takes any motion leaves it out.
+
+        Raises
+        ------
+        MotionRefused
+            ``move_to(goal)`` would refuse, were the arm at ``start``.
+        """
+        del start, goal
+
+    def cautions(self) -> list[str]:
+        """Say in sentences which protection is switched off; every run prints them."""
+        return []
+
     def equip(self, rig: Rig) -> None:
         """Hear what the arm carries, once after opening; for arms that check their own way."""
         del rig
@@ -91,11 +120,18 @@ class Arm(Device, Protocol):
         ...
 
     def stop(self) -> None:
-        """Stop moving now; safe at any time, before opening and after closing too."""
+        """Stop moving now; safe at any time, before opening and after closing too.
+
+        A stop holds: ``move_to`` raises :class:`MotionStopped` until ``resume``, or until the arm is opened again.
+        """
         ...
 
     def interrupt(self) -> None:
         """Make a running ``move_to`` of another thread stop; a driver host calls this before a queued ``stop``."""
+        return
+
+    def resume(self) -> None:
+        """Let the arm move again after a stop. Only an operator's word is a reason to call this."""
         return
 
 

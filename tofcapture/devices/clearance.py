@@ -1,34 +1,42 @@
 """A coarse model of where the arm and the rig may be, stricter than needed, behind the controller's own safety limits.
 
-The arm is a chain of points every few centimetres along its links, the rig a ball about its cameras. None may come near
-the table, into the keep-out cylinder about the object, to the arm's own base, or to its upper arm. Plans are made with
-it, and drivers of real arms check every motion with it. It does not replace safety planes in the controller.
+The arm is the capsules of its model, where its metal is; the rig a capsule about each camera and one from the flange to it.
+None may come near the table, into the keep-out cylinder about the object, to the arm's own base, or to the arm itself.
+Plans are made with it, and drivers of real arms check every motion with it. It does not replace safety planes in the
+controller.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices.kinematics import HOME, ArmModel, link_frames
+from tofcapture.devices.kinematics import HOME, ArmModel, check_joints, joint_frames
 from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.poses import Float64, check_transform
 from tofcapture.rig import Rig
 
-_LINK = 0.08  # m; radius of the arm's links
-_BLOCK = 0.07  # m; radius of the ball about the cameras
+_BRACKET = 0.04  # m; radius of what holds a camera
 _TABLE_MARGIN = 0.04  # m; air above the table, beyond the radii
 _COLUMN = 0.20  # m; the flange and the rig keep this far from the base's axis
 _STEP = np.radians(3.0)  # largest joint step between checks on a path
-_SAMPLES = np.linspace(0.0, 1.0, 8)
+_MOST = np.radians(149.0)  # largest turn of a joint in one motion: a change of the kinematic branch is larger
+_FREE = 3  # pieces of the arm next to each other that cannot meet, or are joined
 
-_SHAPES = {"target": (3,), "board": (3,), "board_normal": (3,), "home": (6,)}  # the others are numbers
+_SHAPES = {
+    "target": (3,), "board": (3,), "board_normal": (3,), "home": (6,), "tof_box": (2, 3), "stereo_box": (2, 3),
+}  # fmt: skip  # the others are numbers
 
 REASONS = ("table", "object", "base", "self")
+Check = Callable[[Float64, Float64], None]
+
+
+def _box(*corners: tuple[float, float, float]) -> Callable[[], Float64]:
+    return lambda: np.array(corners)
 
 
 @dataclass(frozen=True)
@@ -42,6 +50,9 @@ class Workcell:
     keep_out_radius: float = 0.30  # of an upright cylinder about the target
     keep_out_height: float = 0.30  # of it, above the table
     home: Float64 = field(default_factory=HOME.copy)  # (6,) rad; from there every view is reached
+    # (2, 3) corners of each camera's housing in its own frame; the stereo one's is that of an Ensenso N35, left eye in front
+    tof_box: Float64 = field(default_factory=_box((-0.05, -0.05, -0.06), (0.05, 0.05, 0.01)))
+    stereo_box: Float64 = field(default_factory=_box((-0.04, -0.03, -0.05), (0.14, 0.03, 0.01)))
 
 
 def workcell_of(config: Mapping[str, Any]) -> Workcell:
@@ -59,68 +70,141 @@ def workcell_of(config: Mapping[str, Any]) -> Workcell:
     for key, v in values.items():
         shape = _SHAPES.get(key, ())
         if v.shape != shape or not np.isfinite(v).all():
-            raise ConfigError(
-                f"station: [plan] {key}: expected {f'{shape[0]} finite numbers' if shape else 'a finite number'}, got {v.tolist()}"
-            )
+            wanted = f"{' x '.join(map(str, shape))} finite numbers" if shape else "a finite number"
+            raise ConfigError(f"station: [plan] {key}: expected {wanted}, got {v.tolist()}")
+        if shape == (2, 3) and (v[0] >= v[1]).any():
+            raise ConfigError(f"station: [plan] {key}: expected the lower corner first, got {v.tolist()}")
     return workcell
 
 
-def body_points(model: ArmModel, rig: Rig, joints: NDArray[np.floating]) -> tuple[Float64, Float64]:
-    """Points of the arm and of what it carries, base frame, metres, at joint angles (..., 6), radians.
+@dataclass(frozen=True)
+class Body:
+    """Capsules of an arm and of what it carries, base frame, metres."""
 
-    Returns
-    -------
-    (..., 40, 3) along the links, and (..., 3, 3): flange, ToF camera, stereo camera.
-    """
-    frames = link_frames(model, joints)
-    origins, flange = frames[..., :3, 3], frames[..., 5, :, :]
-    a, b = origins[..., :-1, None, :], origins[..., 1:, None, :]
-    links = a + (b - a) * _SAMPLES[:, None]
-    carried = [flange, *(flange @ check_transform(T) for T in (rig.T_flange_tof, rig.T_flange_stereo))]
-    tools = np.stack([T[..., :3, 3] for T in carried], axis=-2)
-    return links.reshape(*links.shape[:-3], links.shape[-3] * len(_SAMPLES), 3), tools
+    arm: Float64  # (..., S, 2, 3) ends of the arm's pieces, from the base to the flange
+    rig: Float64  # (..., 4, 2, 3) ToF camera, stereo camera, what holds each
+    radii: tuple[Float64, Float64]  # (S,) and (4,)
+
+    @property
+    def flange(self) -> Float64:
+        """(..., 3) its centre."""
+        return self.arm[..., -1, 1, :]
+
+    @property
+    def cameras(self) -> Float64:
+        """(..., 5, 3) the flange's centre, and the ends of both cameras' capsules."""
+        ends = self.rig[..., :2, :, :]
+        return np.concatenate([self.flange[..., None, :], ends.reshape(*ends.shape[:-3], 4, 3)], axis=-2)
+
+
+def body_of(model: ArmModel, rig: Rig, workcell: Workcell, joints: NDArray[np.floating]) -> Body:
+    """Find where arm and rig are at joint angles (..., 6), radians."""
+    frames = joint_frames(model, joints)
+    arm = _placed(frames[..., model.frames, :, :], model.metal)
+    flange = frames[..., 6, :, :] @ model.fixed[6]
+    mounts = [check_transform(T) for T in (rig.T_flange_tof, rig.T_flange_stereo)]
+    boxes = [_capsule(box) for box in (workcell.tof_box, workcell.stereo_box)]
+    pieces = [_placed(T[None], ends[None])[0] for T, (ends, _) in zip(mounts, boxes, strict=True)]
+    pieces += [np.stack([np.zeros(3), T[:3, 3]]) for T in mounts]
+    held = _placed(flange[..., None, :, :], np.stack(pieces))
+    return Body(arm, held, (model.radii, np.array([*(r for _, r in boxes), _BRACKET, _BRACKET])))
+
+
+def _placed(T: Float64, ends: Float64) -> Float64:
+    """(..., S, 2, 3) ends (S, 2, 3), each pair moved by its transform (..., S, 4, 4)."""
+    return ends @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+
+
+def _capsule(box: Float64) -> tuple[Float64, float]:
+    """Ends (2, 3) and radius of a capsule along the longest side of a box (2, 3) that holds all of it."""
+    middle, half = box.mean(axis=0), (box[1] - box[0]) / 2
+    long = int(half.argmax())
+    around = float(np.linalg.norm(np.delete(half, long)))
+    radius = 1.15 * around
+    reach = max(0.0, half[long] - np.sqrt(radius**2 - around**2))
+    return middle + np.array([[-1.0], [1.0]]) * reach * np.eye(3)[long], radius
 
 
 def obstacles(
-    model: ArmModel, rig: Rig, workcell: Workcell, joints: NDArray[np.floating]
+    model: ArmModel, rig: Rig, workcell: Workcell, joints: NDArray[np.floating], air: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Say what is in the way at joint angles (..., 6), radians; returns (..., 4), one per entry of :data:`REASONS`."""
-    links, tools = body_points(model, rig, joints)
-    cameras = tools[..., 1:, :]
-    origins = np.concatenate([links[..., :: len(_SAMPLES), :], tools[..., :1, :]], axis=-2)
-    wrist = np.concatenate([origins[..., 3:, :], cameras], axis=-2)
-    return np.stack(
-        [
-            _low(links, workcell, _LINK) | _low(cameras, workcell, _BLOCK),
-            _inside(links, workcell, _LINK) | _inside(cameras, workcell, _BLOCK),
-            (np.linalg.norm(tools[..., :2], axis=-1) < _COLUMN).any(axis=-1),
-            (_to_segment(wrist, origins[..., 0, :], origins[..., 1, :]) < 2 * _LINK).any(axis=-1)
-            | (_to_segment(cameras, origins[..., 1, :], origins[..., 2, :]) < _LINK + _BLOCK).any(axis=-1),
-        ],
-        axis=-1,
+    """Say what is in the way at joint angles (..., 6), radians, with ``air`` metres more room.
+
+    Returns (..., 4), one per entry of :data:`REASONS`. What the table, the object or the base are in the way of is not looked at
+    for itself.
+    """
+    flat = np.asarray(joints, dtype=np.float64).reshape(-1, 6)
+    body = body_of(model, rig, workcell, flat)
+    moving = np.concatenate([body.arm[:, 1:], body.rig], axis=1)
+    thick = np.append(body.radii[0][1:], body.radii[1]) + air
+    out = np.zeros((len(flat), len(REASONS)), dtype=bool)
+    # The shoulder stands on the base, as high above the table as the base stands.
+    out[:, 0] = (moving[:, 1:, :, 2].min(axis=2) < workcell.table + thick[1:] + _TABLE_MARGIN).any(axis=1)
+    out[:, 1] = _in_cylinder(moving, thick, workcell).any(axis=1)
+    out[:, 2] = (np.linalg.norm(body.cameras[..., :2], axis=-1) < _COLUMN + air).any(axis=1)
+    rest = np.flatnonzero(~out.any(axis=1))
+    out[rest, 3] = _meets_itself(body.arm[rest], body.rig[rest], body.radii, air)
+    return out.reshape(*np.shape(joints)[:-1], len(REASONS))
+
+
+def _in_cylinder(pieces: Float64, radii: Float64, workcell: Workcell) -> NDArray[np.bool_]:
+    """Which capsules (N, S, 2, 3) reach into the keep-out cylinder: their axes, where low enough, come too near to its axis."""
+    a, way = pieces[:, :, 0], pieces[:, :, 1] - pieces[:, :, 0]
+    top = workcell.table + workcell.keep_out_height + radii
+    rise = np.where(np.abs(way[..., 2]) < 1e-9, 1e-9, way[..., 2])
+    crossing = np.clip((top - a[..., 2]) / rise, 0.0, 1.0)
+    first, last = np.where(rise > 0, 0.0, crossing), np.where(rise > 0, crossing, 1.0)
+    offset, plane = workcell.target[:2] - a[..., :2], way[..., :2]
+    t = (offset * plane).sum(axis=-1) / np.maximum((plane**2).sum(axis=-1), 1e-12)
+    t = np.clip(t, first, last)
+    gap = np.linalg.norm(offset - t[..., None] * plane, axis=-1)
+    low = pieces[..., 2].min(axis=-1) < top
+    out: NDArray[np.bool_] = low & (gap < workcell.keep_out_radius + radii)
+    return out
+
+
+def _meets_itself(
+    arm: Float64, held: Float64, radii: tuple[Float64, Float64], air: float
+) -> NDArray[np.bool_]:
+    """Tell where pieces (N, S, 2, 3) of the arm come near others that are not their neighbours, or the rig near the arm."""
+    wrist = arm.shape[1] - _FREE  # the first of the last pieces, on which the rig is mounted
+    real = np.flatnonzero(
+        np.linalg.norm(np.diff(arm[:1], axis=2), axis=-1).max(initial=0.0, axis=(0, 2)) > 1e-6
     )
-
-
-def _low(points: Float64, workcell: Workcell, radius: float) -> NDArray[np.bool_]:
-    """Any of the points (..., N, 3) too close above the table."""
-    out: NDArray[np.bool_] = np.any(points[..., 2] < workcell.table + radius + _TABLE_MARGIN, axis=-1)
+    # The flange comes to the forearm only as the rig does that it carries.
+    pairs = [(i, j) for i in real for j in real if j >= i + _FREE and (i < 2 or j >= wrist) and i < wrist - 1]
+    out = np.zeros(len(arm), dtype=bool)
+    for i, j in pairs:
+        out |= segment_gap(arm[:, i], arm[:, j]) < radii[0][i] + radii[0][j] + air
+    for i in real[real < wrist]:
+        gap = segment_gap(arm[:, i, None], held)
+        out |= (gap < radii[0][i] + radii[1] + air).any(axis=1)
     return out
 
 
-def _inside(points: Float64, workcell: Workcell, radius: float) -> NDArray[np.bool_]:
-    """Any of the points (..., N, 3) inside the keep-out cylinder grown by a radius."""
-    aside = np.linalg.norm(points[..., :2] - workcell.target[:2], axis=-1) < workcell.keep_out_radius + radius
-    below = points[..., 2] < workcell.table + workcell.keep_out_height + radius
-    out: NDArray[np.bool_] = np.any(aside & below, axis=-1)
+def segment_gap(first: Float64, second: Float64) -> Float64:
+    """(...,) least distance between segments (..., 2, 3) and (..., 2, 3): Ericson, Real-Time Collision Detection, 5.1.9."""
+    p, d = first[..., 0, :], first[..., 1, :] - first[..., 0, :]
+    q, e = second[..., 0, :], second[..., 1, :] - second[..., 0, :]
+    r = p - q
+    a, b, c = ((x * y).sum(axis=-1) for x, y in ((d, d), (d, e), (d, r)))
+    f, g = (e * r).sum(axis=-1), np.maximum((e * e).sum(axis=-1), 1e-12)
+    a = np.maximum(a, 1e-12)
+    s = np.clip((b * f - c * g) / np.maximum(a * g - b * b, 1e-12), 0.0, 1.0)
+    t = (b * s + f) / g
+    s = np.where(t < 0, np.clip(-c / a, 0.0, 1.0), np.where(t > 1, np.clip((b - c) / a, 0.0, 1.0), s))
+    t = np.clip(t, 0.0, 1.0)
+    out: Float64 = np.linalg.norm(r + s[..., None] * d - t[..., None] * e, axis=-1)
     return out
 
 
-def _to_segment(points: Float64, a: Float64, b: Float64) -> Float64:
-    """(..., N) distance of points (..., N, 3) to the segments a-b (..., 3)."""
-    along = (b - a)[..., None, :]
-    offset = points - a[..., None, :]
-    t = np.clip((offset * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-12), 0, 1)
-    out: Float64 = np.linalg.norm(offset - t[..., None] * along, axis=-1)
+def segment_in_box(segments: Float64, low: Float64, high: Float64) -> NDArray[np.bool_]:
+    """Tell which segments (..., S, 2, 3) have a point in their boxes (S, 3) to (S, 3): the slab method."""
+    a, way = segments[..., 0, :], segments[..., 1, :] - segments[..., 0, :]
+    way = np.where(np.abs(way) < 1e-12, 1e-12, way)
+    one, other = (low - a) / way, (high - a) / way
+    enters, leaves = np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
+    out: NDArray[np.bool_] = (enters <= leaves) & (leaves >= 0) & (enters <= 1)
     return out
 
 
@@ -131,20 +215,40 @@ def straight_way(start: Float64, goal: Float64, step: float) -> Float64:
     return way
 
 
-def is_clear(model: ArmModel, rig: Rig, workcell: Workcell, start: Float64, goal: Float64) -> bool:
-    """Tell whether the straight way in joint space from (6,) to (6,) meets nothing."""
-    return not obstacles(model, rig, workcell, straight_way(start, goal, _STEP)).any()
+def is_clear(
+    model: ArmModel, rig: Rig, workcell: Workcell, start: Float64, goal: Float64, air: float = 0.0
+) -> bool:
+    """Tell whether the straight way in joint space from (6,) to (6,) meets nothing and turns no joint by more than 149 deg."""
+    if np.abs(goal - start).max() > _MOST:
+        return False
+    return not obstacles(model, rig, workcell, straight_way(start, goal, _STEP), air).any()
 
 
-def route(model: ArmModel, rig: Rig, workcell: Workcell, start: Float64, goal: Float64) -> list[Float64]:
+def route(
+    model: ArmModel, rig: Rig, workcell: Workcell, start: Float64, goal: Float64, check: Check | None = None
+) -> list[Float64]:
     """Goals (6,) to visit one after the other: straight if nothing is in the way, else by way of home.
 
-    Raises MotionRefused when neither way is clear.
+    ``check`` is the arm's own, as :meth:`tofcapture.devices.Arm.check_move`. Raises MotionRefused when neither way is clear.
     """
+    check_joints(model, goal)
+    refused = ""
     for way in ([goal], [workcell.home, goal]):
-        if all(is_clear(model, rig, workcell, a, b) for a, b in zip([start, *way], way, strict=False)):
-            return way
+        legs = list(zip([start, *way], way, strict=False))
+        if not all(is_clear(model, rig, workcell, a, b) for a, b in legs):
+            continue
+        try:
+            if check is not None:
+                for a, b in legs:
+                    check(a, b)
+        except MotionRefused as err:
+            refused = f": {err.message}"
+            continue
+        return way
+    turn = np.degrees(start - workcell.home)
+    worst = int(np.abs(turn).argmax())
     raise MotionRefused(
-        "no clear way to the next view, straight or by way of home",
-        hint="move the arm by hand to its home pose; check table, target and keep_out of [plan]",
+        f"no clear way to the next view, straight or by way of home{refused}",
+        hint=f"move the arm by hand to its home pose (joint {worst + 1} is {turn[worst]:+.0f} deg from it); "
+        "check table, target and keep_out of [plan]",
     )

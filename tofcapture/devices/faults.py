@@ -1,11 +1,12 @@
 """States in which an arm or a driver's process cannot go on, each a named error that says what the operator must do.
 
-Nothing leaves such a state by itself: the device raises the same error until the station is opened anew.
+Nothing leaves such a state by itself: the device raises the same error until the station is opened anew. So does a stop on
+request, which every layer that hears one keeps in a :class:`StopLatch`.
 """
 
 from __future__ import annotations
 
-from tofcapture.errors import DeviceError
+from tofcapture.errors import DeviceError, MotionStopped
 
 
 class ArmFault(DeviceError):  # noqa: N818  a state of the arm
@@ -85,3 +86,39 @@ class HostLost(ArmFault):
 
 class NotSettled(DeviceError):  # noqa: N818  a state of the arm
     """The arm arrived but does not come to rest."""
+
+
+class StopLatch:
+    """A stop, from the moment it is heard until the operator resumes; for any number of threads, and in signal handlers.
+
+    A move takes a token before it begins, and asks with it as it goes on: a stop that was heard since counts, even if a
+    resume has followed.
+    """
+
+    def __init__(self) -> None:
+        self._heard = self._lifted = object()
+
+    def stop(self) -> None:
+        """Hear a stop."""
+        self._heard = object()
+
+    def resume(self, token: object) -> None:
+        """Lift the stops that were heard before the token was taken."""
+        self._lifted = token
+
+    @property
+    def token(self) -> object:
+        """What stands for all stops until now."""
+        return self._heard
+
+    def stopped(self, token: object) -> bool:
+        """Tell whether a move with this token must not begin, or not go on."""
+        return self._heard is not token or self._lifted is not token
+
+    def check(self, token: object) -> None:
+        """Raise MotionStopped if :meth:`stopped`."""
+        if self.stopped(token):
+            raise MotionStopped(
+                "the motion was stopped on request",
+                hint="find out why; then run again, or call resume() of the arm",
+            )

@@ -14,7 +14,11 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tofcapture.devices import Arm, Operator, StereoDevice, TofCamera
+from tofcapture.devices.kinematics import ArmModel, dh_model
+from tofcapture.devices.urdf import urdf_model
 from tofcapture.errors import ConfigError, DeviceError, TofError
 
 GROUP = "tofcapture.drivers"
@@ -96,7 +100,8 @@ def make_device(role: str, context: StationContext) -> Any:
         raise ConfigError(
             f"[{role}] driver {name!r}: expected a driver for {role}, it has {', '.join(sorted(drivers))}"
         )
-    device = drivers[role]({k: v for k, v in table.items() if k != "driver"}, context)
+    own = {k: v for k, v in table.items() if k not in {"driver", "kinematics"}}
+    device = drivers[role](own, context)
     if missing := lacking(role, device):
         raise ConfigError(
             f"[{role}] driver {name!r} lacks {', '.join(missing)}",
@@ -109,6 +114,58 @@ def lacking(role: str, device: object) -> list[str]:
     """Names of the role's protocol that a device does not have."""
     names = {n for n in dir(_PROTOCOLS[role]) if not n.startswith("_")} | {"__enter__", "__exit__"}
     return sorted(names - set(dir(device)))
+
+
+def arm_kinematics(arm: Arm, context: StationContext) -> ArmModel:
+    """Find an arm's geometry: its driver's, else that of the station's table ``[arm.kinematics]``.
+
+    Raises
+    ------
+    ConfigError
+        Neither gives it, or both do, or the table is wrong.
+    """
+    table = context.config.get("arm", {}).get("kinematics")
+    try:
+        known = arm.kinematics()
+    except ConfigError as err:
+        if table is not None:
+            return _own_model(arm.describe().model, table, context.folder)
+        raise ConfigError(
+            f"[arm] {context.config.get('arm', {}).get('driver', '')}: nobody knows its kinematics: {err.message}",
+            hint="let the driver's kinematics() return them, or add [arm.kinematics] with urdf or dh; see docs/howto/own-arm.md",
+        ) from err
+    if table is not None:
+        raise ConfigError(
+            f"[arm.kinematics]: the driver brings its own, of the {known.name}; leave the table out"
+        )
+    return known
+
+
+def _own_model(name: str, table: Any, folder: Path) -> ArmModel:
+    """Read ``[arm.kinematics]``; angles are in degrees there, lengths in metres."""
+    if not isinstance(table, Mapping) or ("urdf" in table) == ("dh" in table):
+        raise ConfigError(
+            '[arm.kinematics]: expected either urdf = "arm.urdf" or dh = [[a, d, alpha_deg, theta_deg], ...]'
+        )
+    check_keys(table, ("urdf", "base", "tip", "dh", "low_deg", "high_deg", "radius"), "[arm.kinematics]")
+    limits = {
+        key: np.radians(np.array(table[f"{key}_deg"], dtype=np.float64))
+        for key in ("low", "high")
+        if f"{key}_deg" in table
+    }
+    radius = float(table.get("radius", 0.08))
+    try:
+        if "urdf" in table:
+            return urdf_model(
+                folder / str(table["urdf"]), table.get("base"), table.get("tip"), radius, **limits
+            )
+        rows = np.array(table["dh"], dtype=np.float64)
+        rows[:, 2:] = np.radians(rows[:, 2:])
+        return dh_model(name, rows, radius=radius, **limits)
+    except (TypeError, ValueError, IndexError) as err:
+        raise ConfigError(
+            f"[arm.kinematics]: {err}", hint="dh has six rows of a, d (m), alpha, theta (deg)"
+        ) from err
 
 
 def make_target(target: str, table: Mapping[str, Any], context: StationContext) -> Any:

@@ -19,6 +19,7 @@ from typing import Any, Self
 import numpy as np
 
 from tofcapture.devices import Arm, Device, Operator, StereoDevice, TofCamera
+from tofcapture.devices.faults import StopLatch
 from tofcapture.devices.kinematics import HOME, MODELS, ArmModel, check_joints, forward
 from tofcapture.devices.registry import ROLES, StationContext, check_keys
 from tofcapture.errors import ConfigError, DataError, DeviceError
@@ -170,10 +171,11 @@ class ReplayArm(_Replayed, Arm):
         super().__init__(table, context)
         self._between: Float64 = HOME.copy()
         self._at_view = self._open = False
+        self._latch = StopLatch()
 
     def __enter__(self) -> Self:
         super().__enter__()
-        self._open = True
+        self._open, self._latch = True, StopLatch()
         return self
 
     def __exit__(
@@ -206,6 +208,7 @@ class ReplayArm(_Replayed, Arm):
         DeviceError
             By number, and there is no further view.
         """
+        self._latch.check(self._latch.token)
         self._between = check_joints(self._model(), joints)
         self._at_view = self._replay.go(self._between) is not None
         return self.state()
@@ -214,7 +217,12 @@ class ReplayArm(_Replayed, Arm):
         return MODELS.get(self.describe().model, MODELS["ur10e"])
 
     def stop(self) -> None:
-        """Do nothing: a replayed move is over when it returns."""
+        """Refuse every further move: a replayed one is over when it returns."""
+        self._latch.stop()
+
+    def resume(self) -> None:
+        """Move again when asked."""
+        self._latch.resume(self._latch.token)
 
 
 class ReplayTof(_Replayed, TofCamera):

@@ -8,6 +8,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
+import threading
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -16,7 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture.devices import Arm, Operator, StereoDevice, TofCamera
-from tofcapture.devices.registry import ROLES, StationContext, make_device
+from tofcapture.devices.faults import StopLatch
+from tofcapture.devices.kinematics import ArmModel
+from tofcapture.devices.registry import ROLES, StationContext, arm_kinematics, make_device
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused, TofError
 from tofcapture.files.hdf import stereo_table, tof_table
 from tofcapture.frames import ArmInfo, ArmState
@@ -122,8 +127,9 @@ def open_station(
         rig = _rig(context)
         arm: Arm = devices["arm"]
         arm.equip(rig)
-        if not (allow_motion or arm.simulated):
-            devices["arm"] = LockedArm(arm)
+        for caution in arm.cautions():
+            print(f"tofcapture: caution: {caution}", file=sys.stderr, flush=True)
+        devices["arm"] = StationArm(arm, arm_kinematics(arm, context), allowed=allow_motion or arm.simulated)
         station = Station(**devices, rig=rig, config=config)
         try:
             yield station
@@ -132,31 +138,86 @@ def open_station(
             raise
 
 
-class LockedArm(Arm):
-    """A real arm, open, in a run that does not allow motion: everything but ``move_to`` works."""
+class StationArm(Arm):
+    """The arm of an open station: it moves only in a run that allows it, and after a stop only when the operator resumes.
 
-    def __init__(self, arm: Arm) -> None:
-        self._arm = arm
+    That holds whatever its driver does. All else is the driver's.
+    """
+
+    def __init__(self, arm: Arm, model: ArmModel, *, allowed: bool) -> None:
+        self._arm, self._model, self._allowed = arm, model, allowed
+        self._latch = StopLatch()
+        self._moves: set[object] = set()  # those that run
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._arm, name)
+
+    @property
+    def simulated(self) -> bool:
+        """What the driver says."""
+        return self._arm.simulated
 
     def describe(self) -> ArmInfo:
         """Say what this arm is."""
         return self._arm.describe()
 
+    def kinematics(self) -> ArmModel:
+        """Give the arm's geometry: the driver's, or the station's."""
+        return self._model
+
+    def cautions(self) -> list[str]:
+        """Say which protection is switched off."""
+        return self._arm.cautions()
+
+    def check_move(self, start: Float64, goal: Float64) -> None:
+        """Check a motion as ``move_to`` will."""
+        self._arm.check_move(start, goal)
+
     def state(self) -> ArmState:
         """Measure the joints now."""
         return self._arm.state()
 
+    def move_to(self, joints: Float64) -> ArmState:
+        """Move there, if this run allows it and nobody has said stop; raises MotionRefused."""
+        if not self._allowed:
+            raise MotionRefused(
+                f"the arm {self.describe().model} is real and motion was not allowed in this run",
+                hint="look at --dry-run, clear the workspace, then add --allow-motion",
+            )
+        token, move = self._latch.token, object()
+        self._moves.add(move)  # before the check: a stop that comes after it sees that something moves
+        try:
+            self._latch.check(token)
+            state = self._arm.move_to(joints)
+            self._latch.check(token)
+            return state
+        finally:
+            self._moves.discard(move)
+
     def stop(self) -> None:
-        """Stop moving now."""
+        """Stop moving now, and stay so; a driver that begins a move nevertheless is told again and again."""
+        self._latch.stop()
+        if moves := set(self._moves):
+            threading.Thread(target=self._insist, args=(moves,), daemon=True).start()
         self._arm.stop()
 
-    def move_to(self, joints: Float64) -> ArmState:
-        """Raise MotionRefused, always."""
-        del joints
-        raise MotionRefused(
-            f"the arm {self.describe().model} is real and motion was not allowed in this run",
-            hint="look at --dry-run, clear the workspace, then add --allow-motion",
-        )
+    def interrupt(self) -> None:
+        """Make a running move stop, and stay so."""
+        self.stop()
+
+    def _insist(self, moves: set[object]) -> None:
+        """Tell the driver to stop until these moves are over."""
+        while moves & self._moves:
+            with contextlib.suppress(DeviceError):
+                self._arm.interrupt()
+                self._arm.stop()
+            threading.Event().wait(0.02)
+
+    def resume(self) -> None:
+        """Let the arm move again after a stop."""
+        token = self._latch.token
+        self._arm.resume()
+        self._latch.resume(token)
 
 
 def _open_all(context: StationContext, stack: ExitStack) -> dict[str, Any]:

@@ -3,6 +3,9 @@
 A UR arm reaches far fewer views than one expects. The plan tries thousands of candidates and keeps those that are clear, at
 the goal and on the straight way from home. It picks from them by greedy farthest-point sampling over direction and
 distance: 10 views are the first 10 of 25, so a recording can be extended. A person may turn the object between views.
+
+Each view is held as its way from home and back allows: by the clearance model with room to spare, and by the checks of the arm
+itself. So the way by home is always there, and :func:`prove` shows it before anything moves.
 """
 
 from __future__ import annotations
@@ -15,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices.clearance import REASONS, Workcell, is_clear, obstacles, workcell_of
-from tofcapture.devices.kinematics import ArmModel, arm_model, forward, inverse_all, wrap
+from tofcapture.devices.clearance import REASONS, Check, Workcell, is_clear, obstacles, route, workcell_of
+from tofcapture.devices.kinematics import ArmModel, forward, inverse_all, wrap
 from tofcapture.devices.station import Station
-from tofcapture.errors import ConfigError
+from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.files.view import check_scene_name
 from tofcapture.frames import CALIBRATION
 from tofcapture.poses import Float64, invert, look_at, rotate_vectors
@@ -42,14 +45,20 @@ REMEDIES = {
         "where each way to hold the arm meets something",
         "make room: table, keep-out and base together",
     ),
-    "way from home": ("not to be reached from home in a straight way", "choose another home ([plan] home)"),
+    "way from home": (
+        "not to be reached from home in a straight way that the arm's own checks allow",
+        "choose another home ([plan] home); see workspace, keep_out and max_step_deg of [arm]",
+    ),
 }
 """Why a candidate is no view, in words, and what would help."""
 REFUSALS = tuple(REMEDIES)  # the number of a refusal is its place here
-JOINT_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.25])  # in "close to home" and in travel
+JOINT_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.25])  # in "close to home"
 _LOG_DISTANCE = 0.6  # rad per e-fold of distance: how much a nearer view counts against a turned one
 _FEW = 24  # candidates that each pick of the sampling chooses among
 _MOST_TURNS = 36
+_AIR = (
+    0.005  # m; more room than the checks before a motion ask for: an arm arrives within 0.02 deg, not exactly
+)
 
 
 @dataclass(frozen=True)
@@ -141,7 +150,7 @@ def plan_scene(station: Station, scene: str, views: int, turns: int = 1) -> Plan
         raise ConfigError(f"turns: {limit}, got {turns}")
     digest = hashlib.sha256(f"plan|{station.seed}|{scene}".encode()).digest()
     plan = plan_views(
-        arm_model(station.arm.describe().model),
+        station.arm.kinematics(),
         station.rig,
         workcell,
         workcell.board if board else workcell.target,
@@ -149,6 +158,7 @@ def plan_scene(station: Station, scene: str, views: int, turns: int = 1) -> Plan
         views,
         np.random.default_rng(np.frombuffer(digest, dtype="<u4").tolist()),
         turns,
+        station.arm.check_move,
     )
     if not plan.views:
         raise ConfigError(
@@ -156,6 +166,27 @@ def plan_scene(station: Station, scene: str, views: int, turns: int = 1) -> Plan
             hint="move the target, see [plan] of the station",
         )
     return plan
+
+
+def prove(station: Station, plan: Plan) -> list[list[Float64]]:
+    """Go through a plan in thought, from where the arm stands to home, and check every leg as the arm will.
+
+    Returns the goals (6,) of each view's way, and of the way home after the last one.
+
+    Raises
+    ------
+    MotionRefused
+        A leg is refused; the message names its view.
+    """
+    workcell, model, here = workcell_of(station.config), station.arm.kinematics(), station.arm.state().joints
+    ways = []
+    for name, goal in [*((f"view {v.index}", v.joints) for v in plan.views), ("the way home", workcell.home)]:
+        try:
+            ways.append(route(model, station.rig, workcell, here, goal, station.arm.check_move))
+        except MotionRefused as err:
+            raise MotionRefused(f"{name}: {err.message}", hint=err.hint) from err
+        here = goal
+    return ways
 
 
 def plan_views(
@@ -167,37 +198,55 @@ def plan_views(
     views: int,
     rng: np.random.Generator,
     turns: int = 1,
+    check: Check | None = None,
 ) -> Plan:
     """Plan views of a target (3,), base frame, metres; fewer than wanted where the arm reaches no more.
 
     The same generator gives the same plan. With ``turns`` the object stands in so many ways, a full turn divided by this
-    apart; views of one turn follow each other.
+    apart; views of one turn follow each other. ``check`` is the arm's own of a motion; see ``Arm.check_move``.
     """
     directions, distances = candidates(sampling, rng)
     T_base_flange = flange_poses(rig, target, sampling, directions, distances, rng)
-    joints, refusal = hold_poses(model, rig, workcell, T_base_flange)
-    count = len(joints)
+    holds, refusal = hold_poses(model, rig, workcell, T_base_flange)
+    count = len(refusal)
     angles = 2 * np.pi * np.arange(turns) / turns
     seen = np.concatenate([rotate_vectors(_about_vertical(-angle), directions) for angle in angles])
     features = np.column_stack([seen, _LOG_DISTANCE * np.log(np.tile(distances, turns))])
     if sampling.lean:
         lean = sampling.lean * leans(rig, sampling.axis, T_base_flange[:, 0])
         features = np.column_stack([features, np.tile(lean, (turns, 1))])
+    joints: dict[int, Float64 | None] = {}
 
     def accept(k: int) -> bool:
-        clear = is_clear(model, rig, workcell, workcell.home, joints[k % count])
-        if not clear:
-            refusal[k % count] = REFUSALS.index("way from home")
-        return clear
+        c = k % count
+        if c not in joints:
+            joints[c] = next((q for q in holds(c) if _from_home(model, rig, workcell, q, check)), None)
+            if joints[c] is None:
+                refusal[c] = REFUSALS.index("way from home")
+        return joints[c] is not None
 
     chosen = _spread(features, np.tile(refusal < 0, turns), views, accept, rng)
     planned = [
-        PlannedView(i, joints[c], forward(model, joints[c]), float(distances[c]), directions[c], angle)
+        PlannedView(i, q, forward(model, q), float(distances[c]), directions[c], angle)
         for i, c, angle in ((i, k % count, float(angles[k // count])) for i, k in enumerate(chosen))
+        if (q := joints[c]) is not None
     ]
     refused = {reason: int((refusal == i).sum()) for i, reason in enumerate(REFUSALS)}
     tried = Tried(target + distances[:, None] * directions, refusal)
     return Plan(tuple(_by_travel(planned, workcell.home)), views, count, refused, tried)
+
+
+def _from_home(model: ArmModel, rig: Rig, workcell: Workcell, joints: Float64, check: Check | None) -> bool:
+    """Tell whether the arm goes from home to joints (6,) and back in a straight way."""
+    if not is_clear(model, rig, workcell, workcell.home, joints, _AIR):
+        return False
+    try:
+        if check is not None:
+            check(workcell.home, joints)
+            check(joints, workcell.home)
+    except MotionRefused:
+        return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -272,23 +321,30 @@ def leans(rig: Rig, axis: Float64, T_base_flange: Float64) -> Float64:
 
 def hold_poses(
     model: ArmModel, rig: Rig, workcell: Workcell, T_base_flange: Float64
-) -> tuple[Float64, NDArray[np.int8]]:
-    """Find joints (C, 6), nearest to home, that hold flange poses (C, rolls, 4, 4) and meet nothing; NaN: there are none.
+) -> tuple[Callable[[int], Float64], NDArray[np.int8]]:
+    """Find joints that hold flange poses (C, rolls, 4, 4) and meet nothing, each joint turned as near to home as it can be.
 
-    With them come refusals (C,): indices into :data:`REFUSALS` of what stood in the way, -1 for nothing.
+    Returns a function that gives those of one candidate, (N, 6), the nearest to home first. With it come refusals (C,): indices
+    into :data:`REFUSALS` of what stood in the way, -1 for nothing.
     """
     count = len(T_base_flange)
-    q = workcell.home + wrap(inverse_all(model, T_base_flange) - workcell.home)
+    q = workcell.home + wrap(inverse_all(model, T_base_flange, workcell.home) - workcell.home)
+    # A joint that may not turn that far may still turn the other way round.
+    q = np.where(q > model.high, q - 2 * np.pi, np.where(q < model.low, q + 2 * np.pi, q))
     q = q.reshape(count, -1, 6)
-    reached: Bools = np.all(np.abs(q) <= model.limit, axis=-1)  # NaN is not
+    reached: Bools = np.all((q >= model.low) & (q <= model.high), axis=-1)  # NaN is not
     hits = np.zeros((*reached.shape, len(REASONS)), dtype=bool)
-    hits[reached] = obstacles(model, rig, workcell, q[reached])
+    hits[reached] = obstacles(model, rig, workcell, q[reached], _AIR)
     clear: Bools = reached & ~np.any(hits, axis=-1)
     cost = np.where(clear, (JOINT_WEIGHTS * np.nan_to_num(q - workcell.home) ** 2).sum(axis=-1), np.inf)
-    best = q[np.arange(count), cost.argmin(axis=1)]
-    lost: Bools = ~np.any(clear, axis=1)
-    # Rounded to a millionth, goals are the same on machines whose last bits differ.
-    return np.where(lost[:, None], np.nan, np.round(best, 6)), _refusals(reached, hits, lost)
+
+    def holds(candidate: int) -> Float64:
+        order = np.argsort(cost[candidate], kind="stable")[: int(clear[candidate].sum())]
+        # Rounded to a millionth, goals are the same on machines whose last bits differ.
+        out: Float64 = np.round(q[candidate, order], 6)
+        return out
+
+    return holds, _refusals(reached, hits, ~np.any(clear, axis=1))
 
 
 def _refusals(reached: Bools, hits: Bools, lost: Bools) -> NDArray[np.int8]:
@@ -334,13 +390,11 @@ def _spread(
 
 
 def _by_travel(views: Sequence[PlannedView], home: Float64) -> list[PlannedView]:
-    """Order by turn of the object, then by nearest neighbour in weighted joint space, starting from home."""
+    """Order by turn of the object, then by the nearest neighbour, that is the least turn of the joint with the longest way, from home."""
     left, here, out = list(views), home, []
     while left:
         turn = min(v.turn for v in left)
-        costs = [
-            float(np.abs(JOINT_WEIGHTS * (v.joints - here)).max()) if v.turn == turn else np.inf for v in left
-        ]
+        costs = [float(np.abs(v.joints - here).max()) if v.turn == turn else np.inf for v in left]
         out.append(left.pop(int(np.argmin(costs))))
         here = out[-1].joints
     return out

@@ -16,14 +16,13 @@ from tofcapture import __version__
 from tofcapture.devices.clearance import route, workcell_of
 from tofcapture.devices.contract import check_burst, check_points, check_state, check_tof_info
 from tofcapture.devices.faults import ArmFault
-from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.station import Station
-from tofcapture.errors import ConfigError, DeviceError, MotionRefused
+from tofcapture.errors import ConfigError, DeviceError, MotionRefused, MotionStopped
 from tofcapture.files.seal import write_text
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, TofBurst, View
 from tofcapture.record.journal import JobRefused, Journal, keep_copy, reconcile, utc_now
-from tofcapture.record.observer import Observer
+from tofcapture.record.observer import Observer, Stopped
 from tofcapture.record.plan import Plan, PlannedView, plan_scene
 from tofcapture.record.quality import REFUSE, RETAKE, broken_limits, measure, quality_table
 from tofcapture.record.resources import HeldFolders, check_space, full_disk_named, hold_arm, hold_file
@@ -96,7 +95,7 @@ def record(
     ConfigError
         A driver hands over what its description or the units exclude; or the folder is another one now.
     Stopped
-        The observer, or ``tofcapture stop``, ended the run.
+        The observer, ``tofcapture stop``, or a stop of the arm, ended the run.
     """
     if frames < 1:
         raise ConfigError(f"frames: expected at least 1, got {frames}")
@@ -181,6 +180,11 @@ class _Run:
                 before = self.move(planned)
                 tof, stereo, after = self.expose(planned)
                 numbers = self.check(tof, stereo, before, after)
+            except MotionStopped as err:
+                # No fault of the view: it is taken when somebody asks again.
+                raise Stopped(
+                    err.message, hint="look at the arm; ask for the same scene again to go on"
+                ) from err
             except DeviceError as err:
                 self.stop.check()
                 # A refused motion is refused for good.
@@ -201,10 +205,13 @@ class _Run:
     def move(self, planned: PlannedView) -> ArmState:
         """Move by a clear way; the arm returns settled."""
         self.begin(planned.index, "moving")
-        model, workcell = arm_model(self.station.arm.describe().model), workcell_of(self.station.config)
-        state = self.station.arm.state()
-        for joints in route(model, self.station.rig, workcell, state.joints, planned.joints):
-            state = self.station.arm.move_to(joints)
+        arm, workcell = self.station.arm, workcell_of(self.station.config)
+        state = arm.state()
+        way = route(
+            arm.kinematics(), self.station.rig, workcell, state.joints, planned.joints, arm.check_move
+        )
+        for joints in way:
+            state = arm.move_to(joints)
             check_state(state)
         return state
 
@@ -244,7 +251,7 @@ class _Run:
 
     def give_up(self, index: int, error: DeviceError) -> None:
         """Note that a view failed; raise when the one before it failed too."""
-        # An arm that was told to stop refuses to move: the observer says so, that is no failure of the view.
+        # Whoever was told to stop says so here: that is no failure of the view.
         self.observer.step(index, "failed")
         if view_path(self.recording, self.scene, index).exists():
             self.journal.step(self.scene, index, "")  # it was to be taken again: the one before stays

@@ -18,6 +18,7 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any
 
+from tofcapture.devices.faults import StopLatch
 from tofcapture.devices.host.process import BEAT
 from tofcapture.devices.registry import make_target
 from tofcapture.errors import DeviceError, TofError
@@ -29,9 +30,10 @@ class Child:
     def __init__(self, end: Connection) -> None:
         self._end = end
         self._sending = threading.Lock()
-        self._calls: queue.SimpleQueue[tuple[int, str, tuple[Any, ...]]] = queue.SimpleQueue()
+        self._calls: queue.SimpleQueue[tuple[int, str, tuple[Any, ...], object]] = queue.SimpleQueue()
         self._device: Any = None
-        self._running = False
+        self._latch = StopLatch()
+        self._moving = 0  # the number of the move that runs
         self._heard = time.monotonic()
         self._guard = 60.0
 
@@ -50,23 +52,30 @@ class Child:
             threading.Thread(target=target, daemon=True).start()
         self._send("done", 0, None)
         while True:
-            number, verb, args = self._calls.get()
+            number, verb, args, token = self._calls.get()
             if verb == "exit":
                 return
-            self._call(number, verb, args)
+            self._call(number, verb, args, token)
 
-    def _call(self, number: int, verb: str, args: tuple[Any, ...]) -> None:
-        self._running = True
+    def _call(self, number: int, verb: str, args: tuple[Any, ...], token: object) -> None:
+        self._moving = (
+            number if verb == "move_to" else 0
+        )  # before the check: a stop that comes after it sees that something moves
         try:
+            if self._moving:
+                self._latch.check(token)
             result = getattr(self._device, verb)(*args)
             self._send("done", number, None if verb == "__enter__" else result)
         except BaseException as err:
             self._send("error", number, _as_error(err))
         finally:
-            self._running = False
+            self._moving = 0
 
     def _listen(self) -> None:
-        """Take messages; ``stop`` reaches a driver in the middle of a call by ``interrupt``, past the queue of calls."""
+        """Take messages; ``stop`` reaches a driver in the middle of a move by ``interrupt``, past the queue of calls.
+
+        A move that was asked for before a stop is not begun after it.
+        """
         while True:
             try:
                 message = self._end.recv()
@@ -76,9 +85,18 @@ class Child:
             faulthandler.dump_traceback_later(self._guard, exit=True)
             if message is None:
                 continue
-            if message[1] == "stop" and self._running:
-                self._device.interrupt()
-            self._calls.put(message)
+            if message[1] == "stop":
+                self._latch.stop()
+                threading.Thread(target=self._interrupt, args=(self._moving,), daemon=True).start()
+            elif message[1] == "resume":
+                self._latch.resume(self._latch.token)
+            self._calls.put((*message, self._latch.token))
+
+    def _interrupt(self, move: int) -> None:
+        """Tell the driver again until its move is over: it may only just be beginning it."""
+        while move and self._moving == move:
+            self._device.interrupt()
+            time.sleep(0.02)
 
     def _beat(self) -> None:
         """Give signs of life, and let the driver look after itself."""

@@ -10,8 +10,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from tofcapture.devices import Arm, Device, StereoDevice, TofCamera
-from tofcapture.devices.faults import ArmFault, HostLost
+from tofcapture.devices.faults import ArmFault, HostLost, StopLatch
 from tofcapture.devices.host.process import Host
+from tofcapture.devices.kinematics import ArmModel
 from tofcapture.devices.registry import StationContext, make_target
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.poses import Float64
@@ -105,18 +106,22 @@ class HostedDevice(Device):
             What the driver raised.
         """
         with self._one:
-            host = self._living()
-            try:
-                return host.call(verb, args, self._deadlines.get(verb, 10.0))
-            except ArmFault as fault:
-                host.kill(fault)
-                raise
+            return self._called(verb, *args)
+
+    def _called(self, verb: str, *args: Any) -> Any:
+        host = self._living()
+        try:
+            return host.call(verb, args, self._deadlines.get(verb, 10.0))
+        except ArmFault as fault:
+            host.kill(fault)
+            raise
 
     def _start(self) -> None:
         guard = _GUARD + self._deadlines["__enter__"]
         self._host = Host(self._role, self._order, guard, self._overdue)
         try:
             self._host.call("__enter__", (), self._deadlines["__enter__"], quiet=True)
+            self._host.opening = False
         except DeviceError as err:
             self._host.kill(err)
             raise
@@ -143,10 +148,32 @@ class HostedArm(HostedDevice, Arm):
 
     respawn = 0
 
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._latch = StopLatch()
+
+    def __enter__(self) -> Self:
+        if self._host is None or self._host.lost is not None:
+            self._latch = StopLatch()
+        return super().__enter__()
+
     @property
     def simulated(self) -> bool:
         """True when the driver says so of itself."""
         return bool(self._local.simulated)
+
+    def kinematics(self) -> ArmModel:
+        """Give the arm's geometry, without opening it."""
+        model: ArmModel = self._local.kinematics()
+        return model
+
+    def cautions(self) -> list[str]:
+        """Say which protection is switched off."""
+        return list(self._local.cautions())
+
+    def check_move(self, start: Float64, goal: Float64) -> None:
+        """Have the driver check a motion, as it will before it moves."""
+        self.call("check_move", start, goal)
 
     def equip(self, rig: Rig) -> None:
         """Tell the arm what it carries, for its checks of the way."""
@@ -157,21 +184,34 @@ class HostedArm(HostedDevice, Arm):
         return self.call("state")
 
     def move_to(self, joints: Float64) -> Any:
-        """Move, wait until settled, return the measured state."""
-        return self.call("move_to", joints)
+        """Move, wait until settled, return the measured state; not after a stop."""
+        token = self._latch.token
+        self._latch.check(token)
+        with self._one:
+            self._latch.check(token)
+            return self._called("move_to", joints)
 
     def stop(self) -> None:
-        """Stop now, also in the middle of a move of another thread.
+        """Stop now, also in the middle of a move of another thread, and stay so.
 
-        An arm that cannot be told has its process killed: the watchdog on the controller stops it then.
+        An arm that cannot be told has its process killed: the watchdog on the controller stops it then. While it is being
+        opened nothing moves, and nothing will after.
         """
+        self._latch.stop()
         host = self._host
-        if host is None or host.lost is not None:
+        if host is None or host.lost is not None or host.opening:
             return
         try:
             host.call("stop", (), self._deadlines["stop"])
         except DeviceError as err:
             host.kill(err)
+
+    def resume(self) -> None:
+        """Let the arm move again after a stop."""
+        token = self._latch.token
+        if self._host is not None and self._host.lost is None:
+            self.call("resume")
+        self._latch.resume(token)
 
 
 class HostedTof(HostedDevice, TofCamera):

@@ -61,6 +61,7 @@ class Host:
         self._quiet = True  # a call runs that may hold Python's lock for its whole deadline
         self._heard = time.monotonic()
         self.lost: DeviceError | None = None
+        self.opening = True  # the driver has not said that it is open
         hello: Future[Any] = Future()
         self._pending[0] = hello
         self._end.send({**order, "path": sys.path, "guard": guard})

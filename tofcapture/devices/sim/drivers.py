@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from tofcapture.devices import Arm, Device, Operator, StereoDevice, TofCamera
+from tofcapture.devices.faults import StopLatch
 from tofcapture.devices.kinematics import HOME, arm_model, check_joints, forward
 from tofcapture.devices.registry import check_keys
 from tofcapture.devices.sim import hashed_generator
@@ -86,8 +87,10 @@ class SimArm(_InWorld, Arm):
         check_keys(table, ("model",), "[arm]")
         self._model = arm_model(str(table.get("model", "ur10e")))
         self._joints: Float64 | None = None
+        self._latch = StopLatch()
 
     def __enter__(self) -> Self:
+        self._latch = StopLatch()
         self._go(HOME)
         return self
 
@@ -108,10 +111,11 @@ class SimArm(_InWorld, Arm):
     def move_to(self, joints: Float64) -> ArmState:
         """Move along the joints at the model's speed, settle, and report; takes no time of ours.
 
-        Raises :class:`MotionRefused`: the goal is not six finite angles within the limits.
+        Raises :class:`MotionRefused`: the goal is not six finite angles within the limits, or somebody said stop.
         """
         goal = check_joints(self._model, joints)
         self._world.faults.before_move()
+        self._latch.check(self._latch.token)
         self._go(goal)
         return self.state()
 
@@ -123,7 +127,12 @@ class SimArm(_InWorld, Arm):
         self._joints = goal
 
     def stop(self) -> None:
-        """Do nothing: a simulated move is over when it returns."""
+        """Refuse every further move: a simulated one is over when it returns."""
+        self._latch.stop()
+
+    def resume(self) -> None:
+        """Move again when asked."""
+        self._latch.resume(self._latch.token)
 
 
 class SimTof(_InWorld, TofCamera):

@@ -12,29 +12,29 @@ import numpy as np
 
 from tofcapture.devices import Arm
 from tofcapture.devices.clearance import workcell_of
-from tofcapture.devices.faults import ArmFault, NotReady
-from tofcapture.devices.kinematics import forward
+from tofcapture.devices.faults import ArmFault, NotReady, StopLatch
+from tofcapture.devices.kinematics import check_joints, forward, pose_error
 from tofcapture.devices.ur_rtde.limits import (
     ARRIVED,
     check_goal,
     check_way,
     duration,
     follow,
+    joint_speed,
     read_settings,
     settle,
 )
 from tofcapture.devices.ur_rtde.link import Link, Sample
 from tofcapture.devices.ur_rtde.probe import Controller, probe
-from tofcapture.errors import ConfigError, MotionRefused
+from tofcapture.errors import ConfigError, MotionRefused, MotionStopped
 from tofcapture.frames import ArmInfo, ArmState
-from tofcapture.poses import Float64, invert, rotation_angle, rotation_exp, transform
+from tofcapture.poses import Float64, invert, rotation_exp, transform
 
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
     from tofcapture.rig import Rig
 
-_DECELERATION = 2.0  # rad/s^2 of a stop on request
-_MODEL_ERROR = (0.01, np.radians(1.5))  # m, rad; calibrated arms differ from nominal ones by 1 to 2 mm
+_DECELERATION, _HALT = 2.0, 0.2  # rad/s^2 of a stop on request at least; s that it takes at most
 _PARENT = (2.0, 10.0)  # s of the station's silence that stop a motion, and an idle arm
 
 
@@ -51,8 +51,8 @@ class UrArm(Arm):
         self._controller: Controller | None = None
         self._rig: Rig | None = None
         self._T_flange_tcp: Float64 = np.eye(4)
-        self._limits_known = False
-        self._stop, self._moving, self._closed = threading.Event(), False, threading.Event()
+        self._latch, self._moving, self._closed = StopLatch(), False, threading.Event()
+        self._goal: Float64 | None = None  # where it was sent last
         self._silence = 0.0
         self._fault: ArmFault | None = None
 
@@ -75,6 +75,7 @@ class UrArm(Arm):
         ConfigError
             The arm's pose is not that of the model, or the library is missing.
         """
+        self._latch, self._goal = StopLatch(), None
         self._controller = probe(self._settings)
         self._closed.clear()
         self._link = Link(self._settings.host, scaling=self._controller.scaling)
@@ -92,8 +93,12 @@ class UrArm(Arm):
         self._T_flange_tcp = self._tcp()
         sample = link.fresh()
         self._check_model(sample)
-        # Where the arm stands is within the controller's limits; one that denies it knows none.
-        self._limits_known = self._within(sample.joints)
+        if not self._within(sample.joints):
+            raise NotReady(
+                "the controller says that its safety limits do not allow the pose in which the arm stands",
+                hint="move it within its limits on the pendant. A controller that denies every pose cannot be asked: "
+                '[arm] controller_limits = "ignore" does without, with a caution at each run',
+            )
         if not link.command("setWatchdog", 3.0, self._settings.watchdog_hz):
             raise link.reason("setWatchdog")
 
@@ -106,12 +111,27 @@ class UrArm(Arm):
         """
         self._closed.set()
         if self._link is not None and self._link.playing and self._link.trouble() is None:
-            self._link.command("stopJ", 2.0, _DECELERATION)
+            self._link.command("stopJ", 2.0, self._deceleration)
             self._link.command("stopScript", 2.0)
 
     def equip(self, rig: Rig) -> None:
         """Say what the arm carries; without it nothing moves."""
         self._rig = rig
+
+    def cautions(self) -> list[str]:
+        """Say which checks the station file leaves out."""
+        out = []
+        if self._settings.controller_limits == "ignore":
+            out.append(
+                '[arm] controller_limits = "ignore": the controller is not asked whether goals are within its limits'
+            )
+        if self._settings.pose == "joints":
+            out.append(f'[arm] pose = "joints": nobody checks that this arm is a {self._settings.model.name}')
+        return out
+
+    @property
+    def _deceleration(self) -> float:
+        return max(_DECELERATION, self._settings.speed / _HALT)
 
     def state(self) -> ArmState:
         """Measure the joints now, newer than this call."""
@@ -123,36 +143,51 @@ class UrArm(Arm):
         Raises
         ------
         MotionRefused
-            Motion is not allowed, the goal or the way is refused, or ``stop`` came.
+            Motion is not allowed, the goal or the way is refused, or somebody said stop (MotionStopped).
         NotSettled
             The arm does not come to rest.
         ArmFault
             The named state in which the arm is now.
         """
-        link = self._opened()
+        token, link = self._latch.token, self._opened()
         start = link.fresh()
         goal = self._checked(start, joints)
-        self._stop.clear()
         self._moving = True
         try:
+            self._latch.check(token)
+            self._goal = goal
             if np.abs(goal - start.joints).max() > ARRIVED:
-                self._go(link, start, goal)
-            return self._state(settle(link, self._settings.settle))
-        except ArmFault:
+                self._go(link, start, goal, token)
+            return self._state(settle(link, self._settings.settle, lambda: self._latch.check(token)))
+        except (ArmFault, MotionStopped):
             self._halt(link)
             raise
         finally:
             self._moving = False
 
+    def check_move(self, start: Float64, goal: Float64) -> None:
+        """Check a motion as ``move_to`` does, the controller's own limits too."""
+        if self._rig is None:
+            raise MotionRefused("the arm does not know what it carries", hint="open it as part of a station")
+        goal = check_goal(self._settings, start, goal)
+        check_way(self._settings, self._rig, workcell_of(self._context.config), start, goal)
+        if not self._within(goal):
+            raise MotionRefused("move: the controller's safety limits refuse the goal")
+
     def stop(self) -> None:
-        """Stop now; an arm whose script has ended has stopped already."""
-        link = self._opened()
-        if link.playing:
-            link.command("stopJ", 4.0, _DECELERATION)
+        """Stop now, and stay so; an arm whose script has ended has stopped already."""
+        self._latch.stop()
+        link = self._link
+        if link is not None and not self._closed.is_set() and link.playing:
+            link.command("stopJ", 4.0, self._deceleration)
 
     def interrupt(self) -> None:
         """Make a running ``move_to`` stop; from another thread."""
-        self._stop.set()
+        self._latch.stop()
+
+    def resume(self) -> None:
+        """Move again when asked."""
+        self._latch.resume(self._latch.token)
 
     def watch(self, silence: float) -> None:
         """Look after link, safety and script; stop a motion when the station has fallen silent. See :class:`Device`."""
@@ -161,7 +196,7 @@ class UrArm(Arm):
         if link is None or self._closed.is_set():
             return
         if self._moving and silence > _PARENT[0]:
-            self._stop.set()
+            self._latch.stop()
         fault = self._fault or link.overdue()
         if fault is None and not self._moving:  # a move reports its own faults, after stopping
             fault = link.trouble()
@@ -196,12 +231,9 @@ class UrArm(Arm):
         """Refuse an arm that is not the model of the station file: every check of the way would be wrong."""
         if self._settings.pose == "joints":
             return
-        off = invert(forward(self._settings.model, sample.joints)) @ self._flange(sample)
-        shift, turn = float(np.linalg.norm(off[:3, 3])), rotation_angle(off[:3, :3])
-        if shift > _MODEL_ERROR[0] or turn > _MODEL_ERROR[1]:
+        if wrong := pose_error(self._settings.model, sample.joints, self._flange(sample)):
             raise ConfigError(
-                f"[arm] model {self._settings.model.name}: the controller's flange is {shift * 1e3:.0f} mm, "
-                f"{np.degrees(turn):.1f} deg from where this model's would be",
+                f"[arm] model {self._settings.model.name}: {wrong}",
                 hint='correct [arm] model, or the TCP on the pendant; pose = "joints" does without the controller\'s pose',
             )
 
@@ -214,6 +246,8 @@ class UrArm(Arm):
         return ArmState(sample.joints, self._flange(sample), time.monotonic_ns())
 
     def _within(self, joints: Float64) -> bool:
+        if self._settings.controller_limits == "ignore":
+            return True
         return bool(self._opened().command("isJointsWithinSafetyLimits", 3.0, joints.tolist()))
 
     def _checked(self, start: Sample, joints: Float64) -> Float64:
@@ -222,27 +256,25 @@ class UrArm(Arm):
                 "motion was not allowed in this run",
                 hint="look at --dry-run, clear the workspace, then add --allow-motion",
             )
-        if self._rig is None:
-            raise MotionRefused("the arm does not know what it carries", hint="open it as part of a station")
-        goal = check_goal(self._settings, start.joints, joints)
-        check_way(self._settings, self._rig, workcell_of(self._context.config), start.joints, goal)
-        if self._limits_known and not self._within(goal):
-            raise MotionRefused("move: the controller's safety limits refuse the goal")
+        goal = check_joints(self._settings.model, joints)
+        # As a dry run checked it: from where the arm was sent, if it stands there.
+        there = self._goal is not None and np.abs(self._goal - start.joints).max() < 2 * ARRIVED
+        self.check_move(self._goal if there and self._goal is not None else start.joints, goal)
         return goal
 
-    def _go(self, link: Link, start: Sample, goal: Float64) -> None:
-        settings = self._settings
-        if not link.command("moveJ", 5.0, goal.tolist(), settings.speed, settings.acceleration, True):
+    def _go(self, link: Link, start: Sample, goal: Float64, token: object) -> None:
+        settings, workcell = self._settings, workcell_of(self._context.config)
+        assert self._rig is not None
+        speed = joint_speed(settings, self._rig, workcell, start.joints, goal)
+        if not link.command("moveJ", 5.0, goal.tolist(), speed, settings.acceleration, True):
             raise link.reason("moveJ")
-        seconds = duration(goal - start.joints, settings.speed, settings.acceleration)
-        if not follow(link, goal, seconds, self._stop):
-            self._halt(link)
-            raise MotionRefused("the motion was stopped on request")
+        seconds = duration(goal - start.joints, speed, settings.acceleration)
+        follow(link, goal, seconds, lambda: self._latch.check(token))
 
     def _halt(self, link: Link) -> None:
         """Stop the arm if it can be told; one that cannot has its watchdog."""
         if link.playing and link.seeing:
-            link.command("stopJ", 4.0, _DECELERATION)
+            link.command("stopJ", 4.0, self._deceleration)
 
 
 def _matrix(pose: Float64) -> Float64:

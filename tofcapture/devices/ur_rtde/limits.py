@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofcapture.devices.clearance import Workcell, body_points, is_clear, straight_way
+from tofcapture.devices.clearance import Workcell, body_of, is_clear, segment_in_box, straight_way
 from tofcapture.devices.faults import NotSettled, ProgramStopped
 from tofcapture.devices.kinematics import ArmModel, arm_model, check_joints
 from tofcapture.devices.registry import check_keys
@@ -22,13 +21,14 @@ from tofcapture.poses import Float64
 from tofcapture.rig import Rig
 
 _STEP = np.radians(2.0)  # between checks of the way
-_RADIUS = 0.08  # m; of the arm's links and the rig, by which keep-outs grow
+_CHORD = 1.02  # the way between two checks is longer than its chord, by less than this
 
 _RANGES = {
-    "speed": (0.01, 1.05), "acceleration": (0.05, 1.4), "max_step_deg": (1.0, 360.0), "watchdog_hz": (1.0, 10.0),
+    "speed": (0.01, 1.05), "camera_speed": (0.01, 1.5), "acceleration": (0.05, 1.4), "max_step_deg": (1.0, 360.0), "watchdog_hz": (1.0, 10.0),
     "settle": (0.0, 5.0), "payload": (0.0, 30.0),
 }  # fmt: skip
-_TEXTS = ("model", "host", "serial", "pose")
+_TEXTS = ("model", "host", "serial", "pose", "controller_limits")
+_CHOICES = {"pose": ("controller", "joints"), "controller_limits": ("ask", "ignore")}
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Settings:
     host: str  # address of the controller
     serial: str = ""  # expected serial number of the arm; empty for any
     speed: float = 0.5  # of joints, rad/s
+    camera_speed: float = 0.25  # of flange and cameras, m/s
     acceleration: float = 0.5  # rad/s^2
     max_step_deg: float = (
         150.0  # largest turn of a joint in one motion: a change of the kinematic branch is larger
@@ -51,6 +52,7 @@ class Settings:
     settle: float = 0.3  # s of ringing after the arm is measured at rest
     payload: float = float("nan")  # expected, kg; NaN for any
     pose: str = "controller"
+    controller_limits: str = "ask"  # whether goals are within its safety limits; "ignore": it cannot be asked
     workspace: Float64 | None = None  # (2, 3): flange and cameras stay in this box; None for everywhere
     keep_out: Float64 = field(default_factory=lambda: np.empty((0, 2, 3)))  # (N, 2, 3): nothing enters these
 
@@ -61,8 +63,9 @@ def read_settings(table: Mapping[str, Any]) -> Settings:
     texts = {key: str(table[key]) for key in _TEXTS if key in table}
     if not texts.get("host"):
         raise ConfigError('[arm] ur_rtde: expected host = "address of the controller"')
-    if texts.get("pose", "joints") not in {"controller", "joints"}:
-        raise ConfigError(f"[arm] pose: expected controller or joints, got {texts['pose']!r}")
+    for key, known in _CHOICES.items():
+        if texts.get(key, known[0]) not in known:
+            raise ConfigError(f"[arm] {key}: expected {' or '.join(known)}, got {texts[key]!r}")
     model = arm_model(texts.pop("model", "ur10e"))
     numbers = {key: _number(key, table[key]) for key in _RANGES if key in table}
     boxes = {key: _boxes(key, table[key]) for key in ("workspace", "keep_out") if key in table}
@@ -119,20 +122,29 @@ def check_way(settings: Settings, rig: Rig, workcell: Workcell, start: Float64, 
     MotionRefused
         Out of the workspace, into a keep-out, or against table, object, base or itself.
     """
-    links, tools = body_points(settings.model, rig, straight_way(start, goal, _STEP))
+    body = body_of(settings.model, rig, workcell, straight_way(start, goal, _STEP))
     if settings.workspace is not None:
         low, high = settings.workspace
-        if ((tools < low) | (tools > high)).any():
+        if ((body.cameras < low) | (body.cameras > high)).any():
             raise MotionRefused("move: flange or cameras would leave the [arm] workspace")
-    body = np.concatenate([links, tools], axis=1)
-    for number, (low, high) in enumerate(settings.keep_out):
-        if ((body > low - _RADIUS) & (body < high + _RADIUS)).all(axis=-1).any():
+    pieces, radii = np.concatenate([body.arm, body.rig], axis=1), np.concatenate(body.radii)
+    for number, box in enumerate(settings.keep_out):
+        if segment_in_box(pieces, box[0] - radii[:, None], box[1] + radii[:, None]).any():
             raise MotionRefused(f"move: the way goes through [arm] keep_out {number + 1}")
     if not is_clear(settings.model, rig, workcell, start, goal):
         raise MotionRefused(
             "move: table, object, base or the arm itself is in the way",
             hint="go by way of home; check table, target and keep_out of [plan]",
         )
+
+
+def joint_speed(settings: Settings, rig: Rig, workcell: Workcell, start: Float64, goal: Float64) -> float:
+    """Find the speed of the fastest joint, rad/s, at which neither it nor flange and cameras exceed their limits on a straight way."""
+    way = straight_way(start, goal, _STEP)
+    places = body_of(settings.model, rig, workcell, way).cameras
+    longest = np.abs(np.diff(way, axis=0)).max(axis=1)  # rad of the fastest joint from check to check
+    lever = _CHORD * (np.linalg.norm(np.diff(places, axis=0), axis=-1).max(axis=1) / longest).max()
+    return float(min(settings.speed, settings.camera_speed / max(lever, 1e-6)))
 
 
 ARRIVED = np.radians(0.02)
@@ -143,13 +155,15 @@ _STILL = (1e-3, 1e-4, np.radians(0.02))  # rad/s of any joint; m of the flange; 
 _SETTLING = 3.0  # s
 
 
-def follow(link: Link, goal: Float64, seconds: float, stop: threading.Event) -> bool:
-    """Wait until the arm is at its goal (6,) rad; returns False when ``stop`` ended the wait.
+def follow(link: Link, goal: Float64, seconds: float, check: Callable[[], None]) -> None:
+    """Wait until the arm is at its goal (6,) rad; ``check`` ends the wait by raising MotionStopped.
 
     Half as much again as the planned ``seconds`` and 2 s are granted, longer when the speed slider is low.
 
     Raises
     ------
+    MotionStopped
+        Somebody said stop.
     ProgramStopped
         The arm did not arrive in time.
     ArmFault
@@ -157,8 +171,7 @@ def follow(link: Link, goal: Float64, seconds: float, stop: threading.Event) -> 
     """
     patience, last, near = 1.5 * seconds + 2.0, time.monotonic(), 0
     while near < _READINGS:
-        if stop.is_set():
-            return False
+        check()
         sample = link.sample()
         link.kick_seeing()
         left = float(np.abs(sample.joints - goal).max())
@@ -168,11 +181,12 @@ def follow(link: Link, goal: Float64, seconds: float, stop: threading.Event) -> 
         if patience < 0:
             raise ProgramStopped(f"the arm did not arrive in time: {np.degrees(left):.1f} deg are left")
         time.sleep(_POLL)
-    return True
 
 
-def settle(link: Link, ringing: float) -> Sample:
+def settle(link: Link, ringing: float, check: Callable[[], None]) -> Sample:
     """Wait until joints and flange are at rest, then ``ringing`` seconds; returns what is measured after that.
+
+    ``check`` ends the wait by raising MotionStopped.
 
     Raises
     ------
@@ -189,11 +203,13 @@ def settle(link: Link, ringing: float) -> Sample:
                 f"the arm did not come to rest within {_SETTLING:.0f} s",
                 hint="look for vibration, a loose base, or freedrive being on",
             )
+        check()
         _wait(link, _POLL)
         window.append(link.sample())
         while window[-1].timestamp - window[1].timestamp >= _WINDOW:
             window.popleft()
     _wait(link, ringing)
+    check()
     return link.fresh()
 
 

@@ -36,13 +36,13 @@ _LAYOUT = {
     "VECTOR3D": "3d", "VECTOR6D": "6d", "VECTOR6INT32": "6i", "VECTOR6UINT32": "6I",
 }  # fmt: skip
 
-PLAYING = 2
+AT_REST, PLAYING = 1, 2
 _RUNNING = 7
 _MODES = {
     -1: "no controller", 0: "disconnected", 1: "confirming safety", 2: "booting", 3: "power off", 4: "power on",
     5: "idle, brakes closed", 6: "backdrive", 8: "updating firmware",
 }  # fmt: skip
-_STATES = {0: "is stopping", 1: "stopped", 3: "is pausing", 4: "is paused", 5: "is resuming"}
+_STATES = {0: "is stopping", 1: "stopped", 2: "runs", 3: "is pausing", 4: "is paused", 5: "is resuming"}
 _STOPS: tuple[tuple[int, type[faults.ArmFault], str], ...] = (
     (1 << 5 | 1 << 6 | 1 << 7, faults.EmergencyStop, "emergency stop"),
     (1 << 8, faults.SafetyStop, "safety violation"),
@@ -118,9 +118,12 @@ def danger(bits: int, mode: int) -> faults.ArmFault | None:
 
 def halted(runtime: int) -> faults.ArmFault | None:
     """Name what is wrong with the control script, by ``runtime_state``."""
-    if runtime == PLAYING:
-        return None
-    return faults.ProgramStopped(f"the control script {_STATES.get(runtime, f'is in state {runtime}')}")
+    return None if runtime == PLAYING else faults.ProgramStopped(f"the control script {state(runtime)}")
+
+
+def state(runtime: int) -> str:
+    """Say in words what a program does, by ``runtime_state``."""
+    return _STATES.get(runtime, f"is in state {runtime}")
 
 
 RATE = 125.0  # Hz; more costs CPU and gains nothing for an arm that stands still when it matters

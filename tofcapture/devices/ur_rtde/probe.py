@@ -21,6 +21,7 @@ from tofcapture.devices.ur_rtde.limits import Settings
 
 DASHBOARD = 29999
 _TIMEOUT = 2.0  # s for each answer
+_ENDING = 2.0  # s in which the program of a run before ends, whose watchdog hears nothing any more
 _NEEDED = ("timestamp", "actual_q", "robot_mode", "safety_status_bits", "runtime_state")
 _WANTED = ("payload", "tcp_offset", "speed_scaling")
 
@@ -43,7 +44,8 @@ def probe(settings: Settings) -> Controller:
     ControllerSilent
         Nothing listens, or an answer does not come; says which.
     NotReady
-        Not in remote control, not powered on, another arm, another payload, a PolyScope without these interfaces.
+        Not in remote control, not powered on, another arm, another payload, another program runs, a PolyScope without these
+        interfaces.
     ProtectiveStop, EmergencyStop, SafetyStop
         The controller has stopped the arm.
     StaleData
@@ -56,7 +58,7 @@ def probe(settings: Settings) -> Controller:
                 f"{settings.host}: expected PolyScope 3 or 5, got {'.'.join(map(str, version))}",
                 hint="PolyScope X has no dashboard and no script port; this driver cannot use it",
             )
-        first, second = rtde.two_samples()
+        first, second = rtde.samples()
     if not second["timestamp"] > first["timestamp"]:  # type: ignore[operator]
         raise StaleData(f"{settings.host}: the controller's clock stands still at {second['timestamp']} s")
     fault = wire.danger(int(second["safety_status_bits"]), int(second["robot_mode"]))  # type: ignore[arg-type]
@@ -68,6 +70,11 @@ def probe(settings: Settings) -> Controller:
         raise NotReady(
             f"expected a payload of {settings.payload} kg, the controller has {payload:.2f} kg",
             hint="set payload and centre of gravity on the pendant, or correct [arm] payload",
+        )
+    if second["runtime_state"] != wire.AT_REST:
+        raise NotReady(
+            f"{settings.host}: another program {wire.state(int(second['runtime_state']))} on the controller",  # type: ignore[arg-type]
+            hint="end it first: on the pendant, or where it was started; opening would replace it",
         )
     return Controller(version, serial, second.get("tcp_offset"), "speed_scaling" in second)  # type: ignore[arg-type]
 
@@ -180,10 +187,14 @@ class _Rtde:
             names = found
         raise NotReady(f"{self._host}: the controller lacks {', '.join(set(_NEEDED) - set(names))}")
 
-    def two_samples(self) -> tuple[dict[str, wire.Value], dict[str, wire.Value]]:
-        """Start the data, return two packages of them."""
+    def samples(self) -> tuple[dict[str, wire.Value], dict[str, wire.Value]]:
+        """Start the data, return two packages of them; a later second one while a program runs that may be about to end."""
         recipe = self._recipe()
         if not self._ask(wire.START, b"", "start")[0]:
             raise NotReady(f"{self._host}: the controller does not start its data")
         with _at(self._host, "RTDE's data"):
-            return tuple(recipe.unpack(self._next(wire.DATA)[1:]) for _ in range(2))  # type: ignore[return-value]
+            first, last = (recipe.unpack(self._next(wire.DATA)[1:]) for _ in range(2))
+            end = time.monotonic() + _ENDING
+            while last["runtime_state"] != wire.AT_REST and time.monotonic() < end:
+                last = recipe.unpack(self._next(wire.DATA)[1:])
+        return first, last

@@ -100,7 +100,10 @@ class DaemonLink(Observer):
     def listen(self) -> None:
         """Follow orders until the line ends; then stop the arm and the process. Runs in a thread of its own."""
         for line in self._orders:
-            self._follow(json.loads(line)["do"])
+            try:
+                self._follow(json.loads(line)["do"])
+            except Exception as err:  # whatever a driver does: the next order must be heard
+                self.tell("log", text=f"the arm could not be told to stop: {err}. Press the red button")
         self.stop()
         threading.Event().wait(_LAST_WORDS)
         os._exit(3)
@@ -211,6 +214,8 @@ def _work(job: Mapping[str, Any], link: DaemonLink) -> dict[str, Any]:
         link.station = station
         hint = "look at record --dry-run, clear the workspace, then start the daemon with --allow-motion"
         check_motion_allowed(station, job["allow_motion"], hint)
+        for caution in station.arm.cautions():
+            link.tell("log", text=f"caution: {caution}")
         link.tell("opened", station=station.describe(), simulated=station.simulated)
         staffed = replace(station, operator=PageOperator(link)) if station.operator.person else station
         wish = {key: job[key] for key in ("scene", "recording", "views", "frames", "retake")}
