@@ -225,9 +225,47 @@ class _Credulous(_Arm):
         return self.state()
 
 
-@pytest.mark.parametrize(("arm", "clause"), [(_Inexact, "settled at the goal"), (_Credulous, "refuses NaN")])
+class _Unknown(_Arm):
+    def describe(self):
+        return ArmInfo("acme 6", "1")
+
+
+class _Elsewhere(_Arm):
+    def kinematics(self):
+        return MODELS["ur5e"]
+
+
+class _Forgetful(_Arm):
+    def stop(self):
+        return None
+
+
+class _Stubborn(_Arm):
+    def resume(self):
+        return None
+
+
+class _Shy(_Arm):
+    def check_move(self, start, goal):
+        raise MotionRefused("never")
+
+
+@pytest.mark.parametrize(
+    ("arm", "clause"),
+    [
+        (_Inexact, "settled at the goal"),
+        (_Credulous, "refuses NaN"),
+        (_Unknown, r"kinematics\(\) gives the arm's geometry.*arm.kinematics"),
+        (_Elsewhere, "lead from the measured joints to the measured pose"),
+        (_Forgetful, "after stop"),
+        (_Stubborn, "stopped on request"),
+        (_Shy, "never"),
+    ],
+)
 def test_broken_arms_are_caught(arm, clause):
-    """Arms that miss their goal or go to NaN are named."""
+    """Arms that miss their goal, go to NaN, forget a stop, or whose geometry is missing or another's are named."""
     check_arm(_Arm)
-    with pytest.raises(ContractError, match=clause):
+    with pytest.raises((ContractError, MotionRefused), match=clause):
         check_arm(arm)
+    if arm is _Unknown:
+        check_arm(arm, kinematics=MODELS["ur10e"])

@@ -5,21 +5,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tofcapture.devices import Arm
 from tofcapture.devices.kinematics import (
     HOME,
     MODELS,
     arm_model,
+    dh_model,
     forward,
     inverse,
     inverse_all,
     link_frames,
     wrap,
 )
-from tofcapture.devices.registry import StationContext
+from tofcapture.devices.registry import StationContext, arm_kinematics
 from tofcapture.devices.sim.drivers import SimArm
 from tofcapture.devices.sim.world import FaultPlan, Faults
+from tofcapture.devices.urdf import urdf_model
 from tofcapture.errors import ConfigError, MotionRefused
-from tofcapture.poses import check_transform, rotation_angle, transform
+from tofcapture.frames import ArmInfo
+from tofcapture.poses import check_transform, rotation_angle, rotation_exp, transform
 
 ARMS = sorted(MODELS)
 JOINTS = st.lists(st.floats(-np.pi, np.pi), min_size=6, max_size=6).map(np.array)
@@ -141,3 +145,111 @@ def test_simulated_arm_refuses(tmp_path):
         arm.move_to(np.array([0, 7.0, 0, 0, 0, 0]))
     with pytest.raises(ConfigError, match="colour"):
         _arm(tmp_path, colour="red")
+
+
+def _puma(tmp_path):
+    """An arm with a spherical wrist and a theta offset, by its table and by an equal URDF."""
+    rows = np.array(
+        [
+            [0.0, 0.3, 90, 0], [0.45, 0.0, 0, 90], [0.05, 0.0, 90, 0],
+            [0.0, 0.4, -90, 0], [0.0, 0.0, 90, 0], [0.0, 0.1, 0, 0],
+        ]
+    )  # fmt: skip
+    joints, T = [], np.eye(4)
+    for n, (a, d, alpha, theta) in enumerate(rows):
+        T = T @ transform(rotation_exp(np.array([0, 0, np.radians(theta)])), np.zeros(3))
+        joints.append(_joint(f"j{n}", "revolute", T, f"l{n}", f"l{n + 1}"))
+        T = transform(rotation_exp(np.array([np.radians(alpha), 0, 0])), [a, 0, d])
+    joints.append(_joint("mount", "fixed", T, "l6", "flange"))
+    links = "".join(f'<link name="{name}"/>' for name in (*(f"l{n}" for n in range(7)), "flange"))
+    file = tmp_path / "arm.urdf"
+    file.write_text(f'<robot name="puma">{links}{"".join(joints)}</robot>')
+    return rows, file
+
+
+def _joint(name, kind, T, parent, child, axis="0 0 1"):
+    R = T[:3, :3]
+    rpy = np.arctan2(R[2, 1], R[2, 2]), -np.arcsin(R[2, 0]), np.arctan2(R[1, 0], R[0, 0])
+    place, turn = (" ".join(map(repr, map(float, v))) for v in (T[:3, 3], rpy))
+    limit = '<limit lower="-3" upper="3.1"/>' if kind == "revolute" else ""
+    return (
+        f'<joint name="{name}" type="{kind}"><origin xyz="{place}" rpy="{turn}"/><axis xyz="{axis}"/>{limit}'
+        f'<parent link="{parent}"/><child link="{child}"/></joint>'
+    )
+
+
+def test_any_six_axis_arm_by_table_or_urdf(tmp_path):
+    """A Denavit-Hartenberg table and an equal URDF are one arm; its poses are found again, from anywhere, to a nanometre."""
+    rows, file = _puma(tmp_path)
+    one = dh_model("puma", rows * [1, 1, np.pi / 180, np.pi / 180], low=np.full(6, -3), high=np.full(6, 3.1))
+    other = urdf_model(file, "l0", "flange", 0.08)
+    q = np.random.default_rng(0).uniform(-2.9, 2.9, (200, 6))
+    np.testing.assert_allclose(forward(other, q), forward(one, q), atol=1e-9)
+    np.testing.assert_allclose([other.low, other.high], [one.low, one.high])
+    # By hand: all angles zero, the upper arm stands up (theta 90), the forearm lies along x.
+    np.testing.assert_allclose(forward(one, np.zeros(6))[:3, 3], [0.5, 0.0, 0.8], atol=1e-12)
+    found = inverse_all(one, forward(one, q))
+    there = np.isfinite(found).all(axis=-1)
+    assert there.any(axis=1).mean() > 0.98
+    assert np.abs(forward(one, found[there]) - np.repeat(forward(one, q)[:, None], 4, 1)[there]).max() < 3e-9
+    assert not np.isfinite(inverse_all(one, transform(np.eye(3), [3.0, 0, 0]))).any()
+
+
+def test_a_sideways_axis_of_a_urdf_turns_the_same_way(tmp_path):
+    """A joint about -y turns as -y does, wherever its frame's z points."""
+    _, file = _puma(tmp_path)
+    file.write_text(file.read_text().replace('<axis xyz="0 0 1"/>', '<axis xyz="0 -1 0"/>', 1))
+    model = urdf_model(file, "l0", "flange", 0.08)
+    q = np.array([0.4, 0, 0, 0, 0, 0])
+    turn = transform(rotation_exp(np.array([0, -0.4, 0])), np.zeros(3))
+    np.testing.assert_allclose(forward(model, q), turn @ forward(model, np.zeros(6)), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "pattern"),
+    [
+        (("revolute", "prismatic"), "six turning joints"),
+        (('type="revolute"', 'type="fixed"'), "six turning joints"),
+        (('upper="3.1"', 'upper="lots"'), "lots"),
+        (("</robot>", ""), "cannot read"),
+        (('link="l0"', 'link="l6"'), "six turning joints"),
+    ],
+)
+def test_a_urdf_that_is_no_arm_is_refused(tmp_path, change, pattern):
+    """Joints that slide, too few, words for numbers, a broken file and a circle are named, with the links that there are."""
+    _, file = _puma(tmp_path)
+    file.write_text(file.read_text().replace(*change, 1))
+    with pytest.raises((ConfigError, ValueError), match=pattern):
+        urdf_model(file, "l0", "flange", 0.08)
+
+
+class _Own(Arm):
+    def describe(self):
+        return ArmInfo("acme 6", "1")
+
+
+def test_kinematics_of_an_own_arm(tmp_path):
+    """They come from the driver or from [arm.kinematics], never from both; nobody's are named before anything opens."""
+    rows, _ = _puma(tmp_path)
+
+    def found(arm, **table):
+        config = {"arm": {"driver": "acme", **({"kinematics": table} if table else {})}}
+        return arm_kinematics(arm, StationContext(config, tmp_path))
+
+    assert found(_Own(), dh=rows.tolist(), low_deg=[-170] * 6).low[0] == pytest.approx(np.radians(-170))
+    assert found(_Own(), urdf="arm.urdf", base="l0", tip="flange").high[5] == 3.1
+    with pytest.raises(ConfigError, match="nobody knows its kinematics") as caught:
+        found(_Own())
+    assert "[arm.kinematics]" in caught.value.hint
+    arm = _Own()
+    arm.kinematics = lambda: MODELS["ur5e"]
+    assert found(arm).name == "ur5e"
+    with pytest.raises(ConfigError, match="brings its own, of the ur5e"):
+        found(arm, dh=rows.tolist())
+    for wrong in (
+        {"dh": rows[:5].tolist()}, {"dh": "ur"}, {"urdf": "arm.urdf"}, {"colour": 1}, {"urdf": "none.urdf", "base": "a", "tip": "b"},
+        {"dh": rows.tolist(), "low_deg": [200] * 6, "high_deg": [100] * 6}, {"dh": rows.tolist(), "radius": -1},
+        {"dh": (rows * np.nan).tolist()},
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=r"kinematics|Denavit|limits|URDF"):
+            found(_Own(), **wrong)

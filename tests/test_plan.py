@@ -4,14 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tofcapture.camera import Camera
-from tofcapture.devices.clearance import is_clear, obstacles, route, workcell_of
-from tofcapture.devices.kinematics import HOME, MODELS, forward
-from tofcapture.devices.station import read_station
+from tofcapture.devices.clearance import is_clear, obstacles, route, segment_gap, workcell_of
+from tofcapture.devices.kinematics import HOME, MODELS, forward, link_frames
+from tofcapture.devices.registry import StationContext
+from tofcapture.devices.station import Station, open_station, read_station
+from tofcapture.devices.ur_rtde.arm import UrArm
 from tofcapture.errors import ConfigError, MotionRefused
+from tofcapture.frames import ArmState
 from tofcapture.poses import invert, rotation_exp, transform
-from tofcapture.record.plan import REMEDIES, board_sampling, object_sampling, plan_views
+from tofcapture.record.plan import REMEDIES, board_sampling, object_sampling, plan_scene, plan_views, prove
 from tofcapture.record.quality import board_pose, coverage
 from tofcapture.rig import Rig
 
@@ -191,3 +196,136 @@ def test_missing_stage_is_refused():
     """A station without [plan] cannot be planned for."""
     with pytest.raises(ConfigError, match="plan"):
         workcell_of({})
+
+
+def _beside(model, joints):
+    """Where the metal of a UR is, by the published offsets alone: (4, 2, 3) shoulder, upper arm, forearm, wrist 1."""
+    offsets = {
+        "ur3e": (0.120, 0.027),
+        "ur5e": (0.138, 0.007),
+        "ur10e": (0.1762, 0.0393),
+        "ur20": (0.260, 0.043),
+    }
+    T = link_frames(model, joints)
+    aside = T[0, :3, 2]  # the shoulder's axis; those of elbow and wrist 1 are parallel to it
+    shoulder, elbow = (aside * offset for offset in offsets[model.name])
+    first, second, third, fourth = (T[i, :3, 3] for i in range(4))
+    return np.array(
+        [
+            [first, first + shoulder],
+            [first + shoulder, second + shoulder],
+            [second + elbow, third + elbow],
+            [third + elbow, fourth],
+        ]
+    )
+
+
+def _gap(first, second):
+    """Distance of two segments (2, 3), by sampling one and projecting on the other."""
+    points = first[0] + np.linspace(0, 1, 400)[:, None] * (first[1] - first[0])
+    way = second[1] - second[0]
+    t = np.clip((points - second[0]) @ way / max(way @ way, 1e-12), 0, 1)
+    return np.linalg.norm(points - second[0] - t[:, None] * way, axis=1).min()
+
+
+@pytest.mark.parametrize("name", ["ur3e", "ur5e", "ur10e", "ur20"])
+def test_clear_ways_pass_the_metal(name):
+    """On ways that are called clear, cameras and wrist keep off the arm where its metal is, beside the frames' line; no elbow folds."""
+    model, rng = MODELS[name], np.random.default_rng(5)
+    joints = rng.uniform(-np.pi, np.pi, (3000, 6))
+    clear = joints[
+        ~obstacles(model, RIG, replace(STAGE, table=-3.0, keep_out_radius=0.0), joints).any(axis=1)
+    ]
+    assert len(clear) > 100
+    for q in clear[np.abs(clear[:, 2]) < np.radians(160)][:200]:
+        metal, T = _beside(model, q), link_frames(model, q)
+        flange = T[5]
+        eyes = [(flange @ mount)[:3, 3] for mount in (RIG.T_flange_tof, RIG.T_flange_stereo)]
+        assert min(_gap(np.stack([eye, eye]), part) for eye in eyes for part in metal[:3]) > 0.10
+        assert min(_gap(np.stack([T[4, :3, 3], flange[:3, 3]]), part) for part in metal[:2]) > 0.10
+        assert min(_gap(metal[3], part) for part in metal[:1]) > 0.10
+    folded = HOME.copy()
+    folded[2] = np.radians(178)
+    assert not is_clear(model, RIG, STAGE, HOME, folded)
+    with pytest.raises(MotionRefused, match="joint 3 at 178 deg"):
+        route(model, RIG, STAGE, HOME, folded)
+
+
+@given(st.lists(st.floats(-1, 1), min_size=12, max_size=12))
+def test_gaps_of_segments(numbers):
+    """The closed form is the least distance: never above that of any two points, and reached by sampling."""
+    first, second = np.array(numbers).reshape(2, 2, 3)
+    found = segment_gap(first, second)
+    sampled = _gap(first, second)
+    assert found <= sampled + 1e-9
+    assert sampled <= found + 0.01
+    assert segment_gap(second, first) == pytest.approx(found, abs=1e-9)
+
+
+def test_a_camera_is_as_large_as_the_station_says():
+    """A larger housing of either camera refuses views that a small one takes, and a box whose corners are swapped is named."""
+    joints = np.stack([v.joints for v in _plan(12).views])
+    for key in ("tof_box", "stereo_box"):
+        large = replace(STAGE, **{key: np.array([[-0.3, -0.3, -0.1], [0.5, 0.3, 0.35]])})
+        assert obstacles(UR10E, RIG, large, joints).any()
+    plan = read_station(None)["plan"]
+    with pytest.raises(ConfigError, match="lower corner first"):
+        workcell_of({"plan": {**plan, "tof_box": [[0, 0, 0.1], [0.1, 0.1, 0.0]]}})
+    with pytest.raises(ConfigError, match="2 x 3 finite numbers"):
+        workcell_of({"plan": {**plan, "stereo_box": [1.0, 2.0]}})
+
+
+def _real(model, seed, tmp_path, **more):
+    """The simulated station with a UR's driver, closed, in place of its arm: what it would refuse it says."""
+    config = read_station(None, seed)
+    table = {"host": "127.0.0.1", "model": model, "controller_limits": "ignore", **more}
+    arm = UrArm(table, StationContext(config, tmp_path, allow_motion=True))
+    with open_station() as station:
+        rig = station.rig
+    arm.equip(rig)
+    arm.state = lambda: ArmState(HOME, forward(MODELS[model], HOME), 1)
+    return Station(arm, None, None, None, rig, config)
+
+
+def _completes(station, scene, views):
+    """A plan has all of its views, and each motion between them is one that the driver takes."""
+    plan = plan_scene(station, scene, views)
+    assert len(plan.views) == views
+    ways = prove(station, plan)
+    assert [tuple(way[-1]) for way in ways] == [tuple(v.joints) for v in plan.views] + [tuple(HOME)]
+    here = HOME
+    for goal in [q for way in ways for q in way]:
+        station.arm.check_move(here + 3e-4, goal)  # an arm arrives within 0.02 deg, not exactly
+        assert np.degrees(np.abs(goal - here).max()) < 150
+        here = goal
+
+
+@pytest.mark.parametrize(
+    ("model", "seed", "scene", "views"),
+    [("ur10e", 0, "calibration", 12), ("ur5e", 1, "calibration", 25), ("ur5e", 0, "mug", 25)],
+)
+def test_default_plans_are_completed_by_the_real_driver(tmp_path, model, seed, scene, views):
+    """The driver of the real arm refuses no motion of a default plan."""
+    _completes(_real(model, seed, tmp_path), scene, views)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["ur10e", "ur5e"])
+def test_twenty_seeds_are_completed_by_the_real_driver(tmp_path, model):
+    """Whatever the seed: 12 and 25 board views, 25 of a scene."""
+    for seed in range(20):
+        station = _real(model, seed, tmp_path)
+        for scene, views in (("calibration", 12), ("calibration", 25), ("mug", 25)):
+            _completes(station, scene, views)
+
+
+def test_a_plan_keeps_to_what_the_driver_allows(tmp_path):
+    """Steps of 100 deg at most, a workspace and a keep-out of the driver's own change the plan, and none of its motions is refused."""
+    tight = {"max_step_deg": 100.0, "workspace": [[-0.4, -1.0, -0.5], [1.4, 0.45, 1.4]]}
+    tight["keep_out"] = [[[0.2, -0.9, 0.3], [0.5, -0.5, 0.9]]]
+    station, free = _real("ur10e", 0, tmp_path, **tight), _real("ur10e", 0, tmp_path)
+    plan, other = (plan_scene(one, "calibration", 8) for one in (station, free))
+    assert plan.digest != other.digest
+    prove(station, plan)
+    with pytest.raises(MotionRefused, match=r"view \d+: no clear way .*: move:"):
+        prove(station, other)

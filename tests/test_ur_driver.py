@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 
 from tests.emulated import THERE, at_home, station_file
+from tests.ur_emulator.process import Emulator
 from tofcapture.devices import faults
-from tofcapture.devices.kinematics import MODELS, forward
+from tofcapture.devices.kinematics import HOME, MODELS, forward
 from tofcapture.devices.registry import StationContext, make_device
 from tofcapture.devices.station import open_station
 from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.files.view import read_view, view_path
 from tofcapture.record import recorder
-from tofcapture.record.plan import plan_scene
+from tofcapture.record.plan import plan_scene, prove
 from tofcapture.record.recorder import record
 from tofcapture.testing import check_arm
 
@@ -137,3 +138,39 @@ def test_keeps_the_contract(emulator, tmp_path):
         rig, config = station.rig, station.config
     context = StationContext(config, tmp_path, allow_motion=True)
     check_arm(lambda: make_device("arm", context), prepare=lambda arm: arm.equip(rig))
+
+
+def test_a_controller_that_denies_every_pose_is_no_check(emulator, tmp_path, capfd):
+    """It is refused by name; a setting does without it, and says so in every run; limits that change later refuse the goal."""
+    emulator.order("deny")
+    with pytest.raises(faults.NotReady, match="safety limits do not allow") as caught:
+        open_station(station_file(tmp_path, emulator), allow_motion=True).__enter__()
+    assert "controller_limits" in caught.value.hint
+    assert emulator.order("status")["runtime"] == 1
+    capfd.readouterr()
+    file = station_file(tmp_path, emulator, 'controller_limits = "ignore"')
+    for _ in range(2):
+        with open_station(file, allow_motion=True) as station:
+            assert 'caution: [arm] controller_limits = "ignore"' in capfd.readouterr().err
+            goal = station.arm.state().joints + 0.02
+            assert np.abs(station.arm.move_to(goal).joints - goal).max() < 4e-4
+    emulator.order("lift")
+    with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
+        emulator.order("deny")
+        with pytest.raises(MotionRefused, match="controller's safety limits"):
+            station.arm.check_move(HOME, HOME + 0.02)
+        with pytest.raises(MotionRefused, match="controller's safety limits"):
+            station.arm.move_to(station.arm.state().joints + 0.02)
+
+
+@pytest.mark.parametrize(("model", "seed"), [("ur10e", 0), pytest.param("ur5e", 1, marks=pytest.mark.slow)])
+def test_a_default_plan_is_driven_to_its_end(tmp_path, model, seed):
+    """A planned calibration, its dry run's motions, home and back, on the emulated controller of either arm."""
+    with Emulator(model=model) as emulator:
+        file = station_file(tmp_path, emulator, f'model = "{model}"')
+        emulator.order("haste", factor=10.0)
+        with open_station(file, seed, allow_motion=True) as station:
+            plan = plan_scene(station, "calibration", 5)
+            for goal in [q for way in prove(station, plan) for q in way]:
+                assert np.abs(station.arm.move_to(goal).joints - goal).max() < 4e-4
+    assert len(plan.views) == 5

@@ -189,10 +189,11 @@ def segment_gap(first: Float64, second: Float64) -> Float64:
     r = p - q
     a, b, c = ((x * y).sum(axis=-1) for x, y in ((d, d), (d, e), (d, r)))
     f, g = (e * r).sum(axis=-1), np.maximum((e * e).sum(axis=-1), 1e-12)
-    a = np.maximum(a, 1e-12)
-    s = np.clip((b * f - c * g) / np.maximum(a * g - b * b, 1e-12), 0.0, 1.0)
+    a, across = np.maximum(a, 1e-12), a * g - b * b
+    skew = across > 1e-9 * a * g  # parallel ones: any s does
+    s = np.clip(np.where(skew, b * f - c * g, 0.0) / np.where(skew, across, 1.0), 0.0, 1.0)
     t = (b * s + f) / g
-    s = np.where(t < 0, np.clip(-c / a, 0.0, 1.0), np.where(t > 1, np.clip((b - c) / a, 0.0, 1.0), s))
+    s = np.where(t <= 0, np.clip(-c / a, 0.0, 1.0), np.where(t >= 1, np.clip((b - c) / a, 0.0, 1.0), s))
     t = np.clip(t, 0.0, 1.0)
     out: Float64 = np.linalg.norm(r + s[..., None] * d - t[..., None] * e, axis=-1)
     return out
@@ -218,8 +219,11 @@ def straight_way(start: Float64, goal: Float64, step: float) -> Float64:
 def is_clear(
     model: ArmModel, rig: Rig, workcell: Workcell, start: Float64, goal: Float64, air: float = 0.0
 ) -> bool:
-    """Tell whether the straight way in joint space from (6,) to (6,) meets nothing and turns no joint by more than 149 deg."""
-    if np.abs(goal - start).max() > _MOST:
+    """Tell whether the straight way in joint space from (6,) to (6,) is allowed.
+
+    It meets nothing, ends within the joint limits, and turns no joint by more than 149 deg.
+    """
+    if np.abs(goal - start).max() > _MOST or ((goal < model.low) | (goal > model.high)).any():
         return False
     return not obstacles(model, rig, workcell, straight_way(start, goal, _STEP), air).any()
 

@@ -11,7 +11,8 @@ cosines taken from the same matrix entries, so that it stays exact next to the w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +33,8 @@ _STARTS, _ROUNDS, _FOUND = (
     4,
     40,
     1e-9,
-)  # of the iteration: starts for each pose, steps, and the error (m, rad) it ends at
+)  # of the iteration: starts for each pose, steps, and the error (m, rad) at its end
+_TURN = (-2 * np.pi,) * 6, (2 * np.pi,) * 6
 
 
 class Offsets(NamedTuple):
@@ -75,52 +77,33 @@ def _link(row: Float64, q: NDArray[np.floating]) -> Float64:
     return T
 
 
-def _links(rows: ArrayLike) -> Float64:
-    """(6, 4, 4) fixed parts ``Tz(d) Tx(a) Rx(alpha)`` of Denavit-Hartenberg rows of a, d, alpha."""
-    return np.stack([_link(row, np.zeros(())) for row in np.asarray(rows, dtype=np.float64)])
-
-
 def dh_model(
-    name: str,
-    rows: ArrayLike,
-    low: ArrayLike | None = None,
-    high: ArrayLike | None = None,
-    radius: float = 0.08,
+    name: str, rows: ArrayLike, low: ArrayLike = _TURN[0], high: ArrayLike = _TURN[1], radius: float = 0.08
 ) -> ArmModel:
     """Make the model of an arm from its standard Denavit-Hartenberg table.
 
-    Parameters
-    ----------
-    name, radius
-        What to call it, and how thick to take its links, metres.
-    rows
-        (6, 4) of a, d in metres, alpha, theta in radians; theta is added to the joint's angle.
-    low, high
-        (6,) joint limits, radians; +-2 pi unless given.
-
-    Raises
-    ------
-    ConfigError
-        Another shape, or values that are no numbers.
+    Its rows (6, 4) are a, d in metres, alpha, theta in radians; theta is added to the joint's angle. See :func:`chain_model`.
     """
     table = _numbers(rows, (6, 4), f"{name}: Denavit-Hartenberg rows of a, d, alpha, theta")
-    turns = [_link(np.zeros(3), theta) for theta in table[:, 3]]
-    links = _links(table[:, :3])
-    fixed = [turns[0], *(link @ turn for link, turn in zip(links, [*turns[1:], np.eye(4)], strict=True))]
-    return chain_model(name, np.stack(fixed), low, high, radius)
+    turns = [*(_link(np.zeros(3), theta) for theta in table[:, 3]), np.eye(4)]
+    links = [np.eye(4), *(_link(row, np.zeros(())) for row in table[:, :3])]
+    return chain_model(name, [a @ b for a, b in zip(links, turns, strict=True)], low, high, radius)
 
 
 def chain_model(
-    name: str, fixed: Float64, low: ArrayLike | None, high: ArrayLike | None, radius: float
+    name: str, fixed: ArrayLike, low: ArrayLike = _TURN[0], high: ArrayLike = _TURN[1], radius: float = 0.08
 ) -> ArmModel:
-    """Make a model from fixed transforms (7, 4, 4); its metal goes straight from joint to joint."""
-    turn = np.full(6, 2 * np.pi)
-    low = _numbers(-turn if low is None else low, (6,), f"{name}: lower joint limits")
-    high = _numbers(turn if high is None else high, (6,), f"{name}: upper joint limits")
+    """Make a model from transforms (7, 4, 4): base to first joint, from each turned joint to the next, last joint to flange.
+
+    Its metal goes straight from joint to joint, ``radius`` metres thick. ``low`` and ``high`` (6,) are joint limits, radians.
+    Raises ConfigError: another shape, or values that make no sense.
+    """
+    links = _numbers(fixed, (7, 4, 4), f"{name}: transforms from joint to joint")
+    low, high = (_numbers(a, (6,), f"{name}: joint limits") for a in (low, high))
     if not ((low < high).all() and 0 < radius < 1):
         raise ConfigError(f"{name}: expected lower joint limits below upper ones and a radius of 0 to 1 m")
-    ends = np.stack([np.zeros((7, 3)), fixed[:, :3, 3]], axis=1)
-    return ArmModel(name, fixed, low, high, np.arange(7), ends, np.full(7, radius))
+    metal = np.stack([np.zeros((7, 3)), links[:, :3, 3]], axis=1)
+    return ArmModel(name, links, low, high, np.arange(7), metal, np.full(7, radius))
 
 
 def _numbers(values: ArrayLike, shape: tuple[int, ...], what: str) -> Float64:
@@ -134,46 +117,36 @@ def _numbers(values: ArrayLike, shape: tuple[int, ...], what: str) -> Float64:
 
 
 def _universal(
-    name: str,
-    d: tuple[float, ...],
-    a: tuple[float, ...],
-    offsets: tuple[float, float],
-    radii: tuple[float, ...],
+    name: str, d: Sequence[float], a: Sequence[float], beside: Sequence[float], thick: Sequence[float]
 ) -> ArmModel:
-    """A UR arm: upper arm and forearm stand ``offsets`` beside the line of the frames, along the shoulder's axis.
+    """A UR arm: upper arm and forearm stand ``beside`` the line of the frames, along the shoulder's axis.
 
-    ``radii`` are those of shoulder, upper arm, elbow, forearm and wrist.
+    ``thick`` are the radii of shoulder, upper arm, elbow, forearm and wrist.
     """
-    (d1, d4, d5, d6), (a2, a3), (shoulder, elbow) = d, a, offsets
-    rows = np.stack([[0, a2, a3, 0, 0, 0], [d1, 0, 0, d4, d5, d6], _ALPHA], axis=1)
-    fixed = np.concatenate([np.eye(4)[None], _links(rows)])
+    (d1, d4, d5, d6), (a2, a3), (s, e) = d, a, beside
+    rows = np.stack([[0, a2, a3, 0, 0, 0], [d1, 0, 0, d4, d5, d6], _ALPHA, np.zeros(6)], axis=1)
+    limit = np.array([1, 1, _ELBOW / (2 * np.pi), 1, 1, 1]) * 2 * np.pi
     # Frame 2 turns with the upper arm, 3 with the forearm, 5 and 6 with the wrist; each begins at its joint.
-    pieces = [
-        (0, (0, 0, 0), (0, 0, d1)),
-        (2, (0, 0, 0), (0, 0, shoulder)),
-        (2, (0, 0, shoulder), (a2, 0, shoulder)),
-        (2, (a2, 0, shoulder), (a2, 0, elbow)),
-        (3, (0, 0, elbow), (a3, 0, elbow)),
-        (3, (a3, 0, elbow), (a3, 0, d4)),
-        (5, (0, 0, 0), (0, 0, d5)),
-        (6, (0, 0, 0), (0, 0, d6)),
-    ]
-    limit = np.full(6, 2 * np.pi)
-    limit[2] = _ELBOW
-    frames, metal = (
-        np.array([f for f, *_ in pieces]),
-        np.array([ends for _, *ends in pieces], dtype=np.float64),
+    frames = np.array([0, 2, 2, 2, 3, 3, 5, 6])
+    metal = [
+        [(0, 0, 0), (0, 0, d1)], [(0, 0, 0), (0, 0, s)], [(0, 0, s), (a2, 0, s)], [(a2, 0, s), (a2, 0, e)],
+        [(0, 0, e), (a3, 0, e)], [(a3, 0, e), (a3, 0, d4)], [(0, 0, 0), (0, 0, d5)], [(0, 0, 0), (0, 0, d6)],
+    ]  # fmt: skip
+    radii, closed = np.array(thick)[[0, 0, 1, 2, 3, 4, 4, 4]], Offsets((d1, d4, d5, d6), (a2, a3))
+    return replace(
+        dh_model(name, rows, -limit, limit),
+        frames=frames,
+        metal=np.array(metal, dtype=np.float64),
+        radii=radii,
+        closed=closed,
     )
-    closed = Offsets((d1, d4, d5, d6), (a2, a3))
-    thick = np.array(radii)[[0, 0, 1, 2, 3, 4, 4, 4]]
-    return ArmModel(name, fixed, -limit, limit, frames, metal, thick, closed)
 
 
 # Lengths and offsets are published. Radii hold the collision shapes that are published for the UR5e and the UR10e with 2 cm
 # around them; those of the others go with the diameters of their bases.
 MODELS = {
-    name: _universal(name, d, a, offsets, radii)
-    for name, d, a, offsets, radii in (
+    name: _universal(name, d, a, beside, thick)
+    for name, d, a, beside, thick in (
         ("ur3e", (0.15185, 0.13105, 0.08535, 0.0921), (-0.24355, -0.2132), (0.120, 0.027), (0.075, 0.065, 0.07, 0.055, 0.055)),
         ("ur5e", (0.1625, 0.1333, 0.0997, 0.0996), (-0.425, -0.3922), (0.138, 0.007), (0.08, 0.07, 0.08, 0.06, 0.06)),
         ("ur10e", (0.1807, 0.17415, 0.11985, 0.11655), (-0.6127, -0.57155), (0.1762, 0.0393), (0.1, 0.08, 0.1, 0.08, 0.07)),
@@ -205,11 +178,10 @@ def check_joints(model: ArmModel, joints: ArrayLike) -> Float64:
     if goal.shape != (6,) or not np.isfinite(goal).all():
         raise MotionRefused(f"move: expected 6 finite joint angles, got {goal.tolist()}")
     beyond = np.maximum(model.low - goal, goal - model.high)
-    if (worst := int(beyond.argmax())) is not None and beyond[worst] > 0:
-        low, high = np.degrees((model.low[worst], model.high[worst]))
-        raise MotionRefused(
-            f"move: joint {worst + 1} at {np.degrees(goal[worst]):.0f} deg is outside {low:.0f} to {high:.0f} deg"
-        )
+    worst = int(beyond.argmax())
+    if beyond[worst] > 0:
+        at, low, high = np.degrees([goal[worst], model.low[worst], model.high[worst]])
+        raise MotionRefused(f"move: joint {worst + 1} at {at:.0f} deg is outside {low:.0f} to {high:.0f} deg")
     return goal
 
 

@@ -119,10 +119,7 @@ def lacking(role: str, device: object) -> list[str]:
 def arm_kinematics(arm: Arm, context: StationContext) -> ArmModel:
     """Find an arm's geometry: its driver's, else that of the station's table ``[arm.kinematics]``.
 
-    Raises
-    ------
-    ConfigError
-        Neither gives it, or both do, or the table is wrong.
+    Raises ConfigError: neither gives it, or both do, or the table is wrong.
     """
     table = context.config.get("arm", {}).get("kinematics")
     try:
@@ -131,8 +128,8 @@ def arm_kinematics(arm: Arm, context: StationContext) -> ArmModel:
         if table is not None:
             return _own_model(arm.describe().model, table, context.folder)
         raise ConfigError(
-            f"[arm] {context.config.get('arm', {}).get('driver', '')}: nobody knows its kinematics: {err.message}",
-            hint="let the driver's kinematics() return them, or add [arm.kinematics] with urdf or dh; see docs/howto/own-arm.md",
+            f"[arm]: nobody knows its kinematics: {err.message}",
+            hint="let its driver's kinematics() return them, or add a table [arm.kinematics]; see docs/howto/own-arm.md",
         ) from err
     if table is not None:
         raise ConfigError(
@@ -143,29 +140,19 @@ def arm_kinematics(arm: Arm, context: StationContext) -> ArmModel:
 
 def _own_model(name: str, table: Any, folder: Path) -> ArmModel:
     """Read ``[arm.kinematics]``; angles are in degrees there, lengths in metres."""
-    if not isinstance(table, Mapping) or ("urdf" in table) == ("dh" in table):
-        raise ConfigError(
-            '[arm.kinematics]: expected either urdf = "arm.urdf" or dh = [[a, d, alpha_deg, theta_deg], ...]'
-        )
-    check_keys(table, ("urdf", "base", "tip", "dh", "low_deg", "high_deg", "radius"), "[arm.kinematics]")
-    limits = {
-        key: np.radians(np.array(table[f"{key}_deg"], dtype=np.float64))
-        for key in ("low", "high")
-        if f"{key}_deg" in table
-    }
-    radius = float(table.get("radius", 0.08))
     try:
+        check_keys(table, ("urdf", "base", "tip", "dh", "low_deg", "high_deg", "radius"), "[arm.kinematics]")
+        limits = {
+            k: np.radians(np.array(table[f"{k}_deg"], float)) for k in ("low", "high") if f"{k}_deg" in table
+        }
+        radius = float(table.get("radius", 0.08))
         if "urdf" in table:
-            return urdf_model(
-                folder / str(table["urdf"]), table.get("base"), table.get("tip"), radius, **limits
-            )
-        rows = np.array(table["dh"], dtype=np.float64)
-        rows[:, 2:] = np.radians(rows[:, 2:])
+            return urdf_model(folder / table["urdf"], table["base"], table["tip"], radius, **limits)
+        rows = np.array(table["dh"], dtype=np.float64) * [1, 1, np.pi / 180, np.pi / 180]
         return dh_model(name, rows, radius=radius, **limits)
-    except (TypeError, ValueError, IndexError) as err:
-        raise ConfigError(
-            f"[arm.kinematics]: {err}", hint="dh has six rows of a, d (m), alpha, theta (deg)"
-        ) from err
+    except (AttributeError, KeyError, TypeError, ValueError) as err:
+        hint = "it has urdf, base and tip, or dh = [[a, d, alpha_deg, theta_deg], ...] of six rows, metres"
+        raise ConfigError(f"[arm.kinematics]: {type(err).__name__}: {err}", hint=hint) from err
 
 
 def make_target(target: str, table: Mapping[str, Any], context: StationContext) -> Any:

@@ -24,7 +24,7 @@ from tofcapture.devices.kinematics import ArmModel
 from tofcapture.devices.registry import ROLES, StationContext, arm_kinematics, make_device
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused, TofError
 from tofcapture.files.hdf import stereo_table, tof_table
-from tofcapture.frames import ArmInfo, ArmState
+from tofcapture.frames import ArmState
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig, load_rig
 
@@ -138,7 +138,7 @@ def open_station(
             raise
 
 
-class StationArm(Arm):
+class StationArm:
     """The arm of an open station: it moves only in a run that allows it, and after a stop only when the operator resumes.
 
     That holds whatever its driver does. All else is the driver's.
@@ -152,36 +152,15 @@ class StationArm(Arm):
     def __getattr__(self, name: str) -> Any:
         return getattr(self._arm, name)
 
-    @property
-    def simulated(self) -> bool:
-        """What the driver says."""
-        return self._arm.simulated
-
-    def describe(self) -> ArmInfo:
-        """Say what this arm is."""
-        return self._arm.describe()
-
     def kinematics(self) -> ArmModel:
         """Give the arm's geometry: the driver's, or the station's."""
         return self._model
-
-    def cautions(self) -> list[str]:
-        """Say which protection is switched off."""
-        return self._arm.cautions()
-
-    def check_move(self, start: Float64, goal: Float64) -> None:
-        """Check a motion as ``move_to`` will."""
-        self._arm.check_move(start, goal)
-
-    def state(self) -> ArmState:
-        """Measure the joints now."""
-        return self._arm.state()
 
     def move_to(self, joints: Float64) -> ArmState:
         """Move there, if this run allows it and nobody has said stop; raises MotionRefused."""
         if not self._allowed:
             raise MotionRefused(
-                f"the arm {self.describe().model} is real and motion was not allowed in this run",
+                f"the arm {self._arm.describe().model} is real and motion was not allowed in this run",
                 hint="look at --dry-run, clear the workspace, then add --allow-motion",
             )
         token, move = self._latch.token, object()
@@ -200,10 +179,6 @@ class StationArm(Arm):
         if moves := set(self._moves):
             threading.Thread(target=self._insist, args=(moves,), daemon=True).start()
         self._arm.stop()
-
-    def interrupt(self) -> None:
-        """Make a running move stop, and stay so."""
-        self.stop()
 
     def _insist(self, moves: set[object]) -> None:
         """Tell the driver to stop until these moves are over."""

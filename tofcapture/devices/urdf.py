@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -12,143 +12,74 @@ from tofcapture.devices.kinematics import ArmModel, chain_model
 from tofcapture.errors import ConfigError
 from tofcapture.poses import Float64, rotation_exp, transform
 
-_TURNING = {"revolute", "continuous"}
 
+def urdf_model(path: Path, base: str, tip: str, radius: float, **limits: Float64) -> ArmModel:
+    """Read the six turning joints between the links ``base``, the frame of the arm's poses, and ``tip``, its flange.
 
-def urdf_model(
-    path: Path,
-    base: str | None = None,
-    tip: str | None = None,
-    radius: float = 0.08,
-    low: Float64 | None = None,
-    high: Float64 | None = None,
-) -> ArmModel:
-    """Read the chain of six turning joints between two links.
-
-    Parameters
-    ----------
-    path
-        The file; meshes are not looked at.
-    base, tip
-        Links: the frame of the arm's poses, and the flange. By default the root, and the end of the only chain with six joints.
-    radius
-        How thick to take the links, metres.
-    low, high
-        (6,) joint limits, radians, instead of the file's.
+    Meshes are not looked at: links are ``radius`` metres thick. ``low`` and ``high`` (6,) rad replace the file's joint limits.
 
     Raises
     ------
     ConfigError
-        Not readable, no URDF, no such link, a joint that slides, or other than six joints that turn.
+        Not readable, no URDF, no such link, or other than six joints that turn between them.
+    ValueError
+        Words where numbers should be.
     """
     try:
         root = ET.parse(path).getroot()  # noqa: S314  a file of the user's own station
     except (OSError, ET.ParseError) as err:
         raise ConfigError(f"{path}: cannot read the URDF: {err}", hint="expand xacro files first") from err
-    parents = {
-        _link(joint, "child", path): joint for joint in root.iter("joint") if joint.find("child") is not None
-    }
-    tips = [tip] if tip else [link.get("name", "") for link in root.iter("link")]
-    chains = [_chain(parents, end, base, path) for end in tips]
-    chains = [
-        c
-        for c in chains
-        if sum(j.get("type") in _TURNING for j in c) == 6 and (tip or c[-1] in _last(chains))
-    ]
-    if len(chains) != 1 or {j.get("type") for j in chains[0]} - {*_TURNING, "fixed"}:
+    above = {link.get("link"): joint for joint in root.iter("joint") for link in joint.findall("child")}
+    chain: list[ET.Element] = []
+    link: str | None = tip
+    while link in above and link != base and len(chain) <= len(above):
+        chain.insert(0, above[link])
+        link = next((p.get("link") for p in above[link].findall("parent")), None)
+    moving = [joint for joint in chain if joint.get("type") != "fixed"]
+    if link != base or len(moving) != 6 or {j.get("type") for j in moving} - {"revolute", "continuous"}:
+        names = ", ".join(str(one.get("name")) for one in root.iter("link"))
+        found = ", ".join(f"{j.get('name')} ({j.get('type')})" for j in moving) or "none"
         raise ConfigError(
-            f"{path}: expected one chain of six turning joints, got {len(chains)}"
-            + (f" from {base or 'the root'} to {tip}" if tip else ""),
-            hint="name its ends: base and tip of [arm.kinematics]",
+            f"{path}: expected six turning joints from {base!r} to {tip!r}, got {found}",
+            hint=f"base and tip of [arm.kinematics] are two of its links: {names}",
         )
-    return _model(root.get("name", path.stem), chains[0], radius, low, high, path)
-
-
-def _link(joint: ET.Element, which: str, path: Path) -> str:
-    link = joint.find(which)
-    if link is None or not link.get("link"):
-        raise ConfigError(f"{path}: joint {joint.get('name')} names no {which}")
-    return str(link.get("link"))
-
-
-def _chain(parents: Mapping[str, ET.Element], tip: str, base: str | None, path: Path) -> list[ET.Element]:
-    """Joints from base to tip; none when the base is not above the tip."""
-    out: list[ET.Element] = []
-    while tip in parents and tip != base:
-        if parents[tip] in out:
-            raise ConfigError(f"{path}: the joints go in a circle at {tip}")
-        out.insert(0, parents[tip])
-        tip = _link(parents[tip], "parent", path)
-    return out if base in {None, tip} else []
-
-
-def _last(chains: list[list[ET.Element]]) -> list[ET.Element]:
-    """The joints that end a chain and are part of no longer one."""
-    inner = [joint for chain in chains for joint in chain[:-1]]
-    return [chain[-1] for chain in chains if chain and chain[-1] not in inner]
-
-
-def _model(
-    name: str,
-    chain: list[ET.Element],
-    radius: float,
-    low: Float64 | None,
-    high: Float64 | None,
-    path: Path,
-) -> ArmModel:
-    fixed, T, limits = [], np.eye(4), []
+    fixed, T, ends = [], np.eye(4), []
     for joint in chain:
-        origin = joint.find("origin")
-        T = T @ (np.eye(4) if origin is None else _origin(origin, path))
-        if joint.get("type") == "fixed":
-            continue
-        axis = _vector(joint.find("axis"), "xyz", "1 0 0", path)
-        turned = transform(_onto(axis), np.zeros(3))
-        fixed.append(T @ turned)
-        T = turned.T
-        limit = joint.find("limit")
-        if limit is None or joint.get("type") == "continuous":
-            limits.append([-2 * np.pi, 2 * np.pi])
-        else:
-            limits.append([_number(limit, key, path) for key in ("lower", "upper")])
-    ends = np.array(limits).T
+        T = T @ _origin(joint.find("origin"))
+        if joint in moving:
+            turned = _z_onto(_vector(joint.find("axis"), "xyz", "1 0 0"))
+            fixed.append(T @ turned)
+            T = turned.T
+            limit = joint.find("limit") if joint.get("type") == "revolute" else None
+            ends.append([-2 * np.pi, 2 * np.pi] if limit is None else _limits(limit))
+    low, high = np.array(ends).T
     return chain_model(
-        name,
-        np.stack([*fixed, T]),
-        ends[0] if low is None else low,
-        ends[1] if high is None else high,
-        radius,
+        str(root.get("name")), [*fixed, T], radius=radius, **{"low": low, "high": high, **limits}
     )
 
 
-def _origin(element: ET.Element, path: Path) -> Float64:
+def _limits(element: ET.Element) -> list[float]:
+    return [float(element.get(key, "0")) for key in ("lower", "upper")]
+
+
+def _origin(element: ET.Element | None) -> Float64:
     """(4, 4) of xyz and of rpy: turns about the fixed axes x, y, z, in this order."""
-    roll, pitch, yaw = _vector(element, "rpy", "0 0 0", path)
-    turns = [rotation_exp(np.eye(3)[i] * angle) for i, angle in ((2, yaw), (1, pitch), (0, roll))]
-    return transform(turns[0] @ turns[1] @ turns[2], _vector(element, "xyz", "0 0 0", path))
+    turns = [
+        rotation_exp(axis * angle) for axis, angle in zip(np.eye(3), _vector(element, "rpy"), strict=True)
+    ]
+    return transform(turns[2] @ turns[1] @ turns[0], _vector(element, "xyz"))
 
 
-def _number(element: ET.Element, key: str, path: Path) -> float:
-    try:
-        return float(element.get(key, "0"))
-    except ValueError as err:
-        raise ConfigError(f"{path}: {key}: expected a number, got {element.get(key)!r}") from err
-
-
-def _vector(element: ET.Element | None, key: str, default: str, path: Path) -> Float64:
-    text = default if element is None else element.get(key, default)
-    try:
-        out = np.array([float(x) for x in text.split()])
-    except ValueError:
-        out = np.empty(0)
-    if out.shape != (3,) or not np.isfinite(out).all():
-        raise ConfigError(f"{path}: {key}: expected three numbers, got {text!r}")
+def _vector(element: Any, key: str, default: str = "0 0 0") -> Float64:
+    out: Float64 = np.array(
+        (default if element is None else element.get(key, default)).split(), dtype=np.float64
+    )
     return out
 
 
-def _onto(axis: Float64) -> Float64:
-    """(3, 3) rotation that turns z onto an axis."""
+def _z_onto(axis: Float64) -> Float64:
+    """(4, 4) rotation that turns z onto an axis."""
     z = axis / np.linalg.norm(axis)
     x = np.cross(np.eye(3)[int(np.abs(z).argmin())], z)
     x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
+    return transform(np.stack([x, np.cross(z, x), z], axis=1), np.zeros(3))
