@@ -88,10 +88,11 @@ def test_recording_completes_after_a_protective_stop(emulator, tmp_path, monkeyp
     monkeypatch.setattr(recorder, "plan_scene", _planned_once())
     file, recording = station_file(tmp_path, emulator), tmp_path / "recording"
     emulator.order("protective_stop", share=0.5)
-    with open_station(file, allow_motion=True) as station:
-        result = record(station, "mug", recording, views=1, frames=1)
-    assert result.failed == (0,)
-    assert "protective stop" in result.reasons[0]
+    with (
+        pytest.raises(faults.ProtectiveStop, match="protective stop"),
+        open_station(file, allow_motion=True) as station,
+    ):
+        record(station, "mug", recording, views=1, frames=1)
     with pytest.raises(faults.ProtectiveStop, match="protective"), open_station(file, allow_motion=True):
         pass
     assert emulator.order("status")["safety"] == "PROTECTIVE_STOP"
