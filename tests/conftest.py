@@ -53,3 +53,12 @@ def sealed(tmp_path_factory):
 def here(sealed, tmp_path):
     """A copy to damage."""
     return shutil.copytree(sealed, tmp_path / "copy")
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Pixels of the figures that matplotlib saves during a test, in their order."""
+    pytest.importorskip("matplotlib")
+    from tests.pictures import watch_matplotlib
+
+    return watch_matplotlib(monkeypatch)

@@ -32,6 +32,7 @@ from calibration.registration.gate import (
 )
 from calibration.registration.pairs import Pair, pair_of
 from calibration.registration.rims import rim_cloud, stereo_rims, tof_rims
+from tests import answers
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, QualityError
@@ -390,6 +391,12 @@ def test_range_residual_recovers_a_wave():
         registrations.append(measure_registration(np.eye(4), source, target))
     found = fit_range_residual(pairs, registrations, RangeError(100e6))
     np.testing.assert_allclose(found.harmonics[1], truth.harmonics[0], atol=2e-4)
+
+
+def test_evidence_and_rig_are_what_they_were(recording, aligned):
+    """Of one recording: every pair's numbers, the checks, and the file that the other programs read."""
+    told = {"evidence": aligned[1], "rig": (recording / "rig.toml").read_text()}
+    answers.hold("align", told, off=0.03, least=1e-4, without=("provenance",))
 
 
 def test_align_command_reports_as_text_and_json(recording, monkeypatch):

@@ -17,6 +17,7 @@ from calibration.board.detector import detect
 from calibration.board.drawing import describe, dxf, stl, svg
 from calibration.board.fit import Model, Sight, on_front, refine
 from calibration.board.geometry import Board, board_from, distance_to_ring, load_board, symmetries
+from tests import answers
 from tests.commands import calibrate
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.shapes import BOARD_SIZE
@@ -295,6 +296,10 @@ def test_coverage_names_what_is_missing():
     assert missing(many) == []
     np.testing.assert_allclose(many["tilt_deg"], 28.0, atol=3.0)
     assert "9 board views, 0.50 to 0.90 m" in meter(many)
+    answers.hold(
+        "coverage",
+        {"one": coverage([pose(2.0)], CAMERA, outline), "look": one, "many": many, "meter": meter(many)},
+    )
 
 
 def test_coverage_of_nothing():

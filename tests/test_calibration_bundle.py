@@ -7,10 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.bundle import ARM_SIGMA, BoardFit, consistency, solve_bundle
+from calibration.bundle import ARM_SIGMA, BoardFit, bundle_report, consistency, solve_bundle
+from calibration.cli.hand_eye import bundle_table
 from calibration.hand_eye.checks import Cause, HandEyeRefused
+from tests import answers
 from tofcapture import poses
+from tofcapture.camera import Camera
 from tofcapture.errors import QualityError
+from tofcapture.rig import Rig
 
 X_TOF = poses.transform(poses.rotation_exp([0.1, -0.3, 1.2]), [0.05, 0.02, 0.09])
 X_STEREO = X_TOF @ poses.transform(poses.rotation_exp([0.045, 0.012, 0.009]), [-0.05, 0.075, 0.004])
@@ -96,13 +100,21 @@ def test_a_loose_camera_is_noticed():
     """A rig transform that is 3 mm and half a degree away from what the arm says does not agree."""
     rng = np.random.default_rng(3)
     arm = arms(rng)
-    bundle = solve_bundle(arm, fits_of(arm, rng))
+    fits = fits_of(arm, rng)
+    bundle = solve_bundle(arm, fits)
     true = poses.invert(X_TOF) @ X_STEREO
     said, sigma = consistency(bundle, true), np.sqrt(np.diag(bundle.rig_covariance()))
     assert said["agrees"]
     assert said["standard_error"]["translation_mm"] == pytest.approx(1e3 * sigma[:3])
     assert said["standard_error"]["rotation_deg"] == pytest.approx(np.degrees(sigma[3:]))
     assert not consistency(bundle, poses.exp([0.003, 0, 0, 0, 0.009, 0]) @ true)["agrees"]
+    camera = Camera(4, 3, 2.0, 2.0, 1.5, 1.0)
+    data = bundle_report(
+        bundle, fits, Rig(camera, camera, true, X_TOF @ poses.exp([0.001, 0, 0, 0, 0, 0.01]))
+    )
+    answers.hold(
+        "bundle", {"data": data, "text": bundle_table({**data, "refused": ["view-003 tof: no board"]})}
+    )
 
 
 def test_stated_covariances_that_are_too_small_are_scaled():

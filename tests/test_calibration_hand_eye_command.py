@@ -11,6 +11,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calibration.hand_eye.files import read_pairs, read_poses, readings_of
+from tests import answers
 from tests.commands import calibrate
 from tests.hand_eye import apart, station, streams
 from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects
@@ -56,6 +57,7 @@ def test_a_recording_gives_the_stereo_camera_on_the_flange(recorded):
     assert moved < 1e-3
     assert np.degrees(turned) < 0.1
     assert (data["camera"], data["mount"], data["pairs"]) == ("stereo", "eye-in-hand", 8)
+    answers.hold("hand-eye-recording", data, off=0.05)
 
 
 def test_a_recording_of_too_few_views_is_refused(recorded, tmp_path):
@@ -172,6 +174,7 @@ def test_command_reads_pairs_and_writes_json(tmp_path):
     one = calibrate("hand-eye", tmp_path / "pairs.json", "--out", out)
     two = calibrate("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv")
     written = json.loads(out.read_text())
+    answers.hold("hand-eye", {"file": written, "text": one.text}, names=[(tmp_path, "FOLDER")])
     np.testing.assert_allclose(written["T_flange_camera"], two.data["T_flange_camera"], atol=1e-6)
     assert apart(np.array(written["T_flange_camera"]), X)[1] < 0.002
     assert f"{1e3 * written['T_flange_camera'][0][3]:.2f}" in one.text
@@ -202,6 +205,7 @@ def test_command_finds_the_offset_of_streams(tmp_path):
         np.savetxt(tmp_path / name, np.c_[stream.seconds, rows(stream.poses)], fmt="%.9f")
     data = calibrate("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv").data
     assert abs(data["time_offset_s"] - 0.25) < 0.002
+    answers.hold("hand-eye-streams", data)
     assert apart(np.array(data["T_flange_camera"]), truth)[1] < 0.002
 
 

@@ -19,6 +19,7 @@ from calibration.alignment.views import HALO_RADII, TERMS, JointView, halo_error
 from calibration.range_error.terms import jackknife
 from calibration.registration.clouds import Cloud
 from calibration.registration.rims import Rims, lit_rims, square_rims
+from tests import answers
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, QualityError
@@ -285,6 +286,7 @@ def test_joint_evidence_holds_covariance_and_suggestion():
     rng = np.random.default_rng(6)
     found = joint_icp([made_view(i, rng, noise=5e-4) for i in range(4)], GUESS)
     evidence = joint_evidence(found, HZ)
+    answers.hold("joint", {"evidence": evidence, "T": found.T_tof_stereo}, off=0.05, least=1e-5)
     assert np.array(evidence["covariance"]).shape == (6, 6)
     assert len(evidence["observability"]["eigenvalues"]) == 6
     assert evidence["observability"]["unconstrained"] == []

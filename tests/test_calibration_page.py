@@ -31,6 +31,7 @@ from calibration.evidence.page import (
     write_evidence_page,
 )
 from calibration.limits import LENS, LIMITS, judged, worst
+from tests import pictures
 from tofcapture.camera import Camera
 from tofcapture.colours import Scale
 from tofcapture.devices.sim.config import read_constants
@@ -132,12 +133,13 @@ def test_board_is_found_in_a_simulated_view(view, camera):
         detect(sight, load_board("second"), intrinsics)
 
 
-def test_page_stands_alone(recording):
+def test_page_stands_alone(recording, drawn):
     """The page is written, holds no script and no address, and all its charts are well-formed."""
     out = write_evidence_page(recording, load_old(recording / "rig.toml"))
     page = out.read_text()
     assert "<script" not in page
     assert not re.search(r'(?:src|href)="(?!#|data:)', page)
+    pictures.hold("evidence", drawn)
     charts_found = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
     assert len(charts_found) >= 8
     for chart in charts_found:

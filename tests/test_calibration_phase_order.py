@@ -10,6 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from calibration.phase_order.find import PhaseOrderRefused, find_phase_order
+from tests import answers
 from tests.commands import calibrate
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError, FormatError, UsageError
@@ -187,6 +188,7 @@ def test_command_finds_and_writes(tmp_path):
     np.testing.assert_allclose(written["phase_rad"], theta)
     for k, line in enumerate(outcome.text.splitlines()[1:9]):
         assert [float(x) for x in line.split()] == [k, hz[k] / 1e6, round(np.degrees(theta[k]))]
+    answers.hold("phase-order", {"data": written, "text": outcome.text})
     three, far, *_ = made(6, (60e6,), phases=(3,))
     np.savez(tmp_path / "three.npz", **{f"phase{k}": three[:, k] for k in range(3)})
     np.save(tmp_path / "far.npy", far)

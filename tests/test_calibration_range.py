@@ -10,6 +10,7 @@ import pytest
 
 from calibration.range_error.fit import fit_ranges
 from calibration.range_error.views import seen_of, surface_at_pixels
+from tests import answers
 from tests.commands import calibrate
 from tofcapture import poses
 from tofcapture.camera import Camera
@@ -185,6 +186,7 @@ def test_command_writes_rig_and_report(recording):
     written = json.loads((recording / "range.json").read_text())
     assert written["transform"] == "nothing"
     assert written == dry.data == {k: v for k, v in outcome.data.items() if k != "rig"}
+    answers.hold("range", {"data": written, "text": outcome.text}, off=0.03, least=1e-4)
     for word in ("align", "temperature varied by 0.0 K", "no term of dark"):
         assert word in outcome.text
     with pytest.raises(UsageError, match="harmonics"):

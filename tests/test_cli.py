@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import answers
 from tofcapture.cli import GROUP, main, parser
 from tofcapture.cli.kit import Command
 
@@ -160,3 +161,25 @@ def test_help_fits_a_terminal_of_eighty_columns(name, monkeypatch):
     body, _, example = text.partition("example:")
     assert max(map(len, body.splitlines())) <= 80
     assert not name or example
+
+
+def test_options_are_what_scripts_rely_on():
+    """Names, defaults, numbers of values and choices of every option of every command; there may be more of them."""
+    answers.hold("options", {name: _options(parser({name: c})) for name, c in COMMANDS.items()})
+
+
+def _options(given):
+    """What a parser takes, those of its commands included; its words apart."""
+    found = {}
+    for action in given._actions:
+        if isinstance(action.choices, dict):
+            found |= {name: _options(sub) for name, sub in action.choices.items()}
+            continue
+        if action.default is argparse.SUPPRESS:  # --help and --version
+            continue
+        kind = getattr(action.type, "__name__", None)
+        told = (action.dest, action.nargs, action.required, action.default, kind, action.choices)
+        found[" ".join(action.option_strings) or action.dest] = [
+            list(x) if isinstance(x, range | set | tuple) else x for x in told
+        ]
+    return found

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from benchmarks.ground_truth import class_errors, crop_shares
+from tests import answers
 from tests.test_ops_clean import inside
 from tofcapture.cli import main
 from tofcapture.dataset import sample as sampling
@@ -266,6 +267,7 @@ def test_build_check_and_read(recording, tmp_path):
     assert 0.2 < result.gt.coverage <= 1
     card = (out / "README.md").read_text()
     assert "| train | 2 |" in card
+    answers.hold("build", {"gt": result.gt.table(), "config": load_manifest(out).config}, off=0.05)
     described = json.loads((out / "croissant.json").read_text())
     promised = {d["contentUrl"]: d["sha256"] for d in described["distribution"]}
     assert promised.pop("manifest.json") == sha256_of(out / "manifest.json")

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests import answers, pictures
 from tests.test_dataset_card import make
 from tofcapture.camera import Camera
 from tofcapture.cli import main
@@ -87,12 +88,14 @@ def test_planted_outliers_are_named():
     assert outliers([]) == []
 
 
-def test_the_page_and_the_command(dataset, tmp_path, capsys):
+def test_the_page_and_the_command(dataset, drawn, tmp_path, capsys):
     """The page needs nothing else and shows the very numbers of the JSON, as the text does."""
-    pytest.importorskip("matplotlib")
     page = tmp_path / "page.html"
     assert main(["stats", str(dataset), "--html", str(page), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
+    answers.hold(
+        "stats", answer, without=("manifest_sha256",), names=[(dataset, "DATASET"), (tmp_path, "FOLDER")]
+    )
     assert answer["splits"]["test"]["views"] == 2
     html = page.read_text(encoding="utf-8")
     assert "<script" not in html
@@ -100,6 +103,8 @@ def test_the_page_and_the_command(dataset, tmp_path, capsys):
     assert answer["manifest_sha256"] in html
     assert html.count('<svg class="chart"') == 6
     assert html.count("<figure><img") == 3 * 6  # a view of each scene, six pictures
+    pictures.hold("stats", drawn)
+    pictures.hold("stats-views", pictures.of_page(html))
     assert main(["stats", str(dataset)]) == 0
     text = capsys.readouterr().out
     for split, said in answer["splits"].items():

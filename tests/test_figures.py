@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 
+from tests import pictures
 from tests.test_dataset_build import make_sample, simulate, true_rig
 from tests.test_files_shard import write
 from tofcapture.cli import main
@@ -65,21 +66,22 @@ def _size(data):
 
 
 @pytest.mark.parametrize("kind", ["acquisition", "preprocessing"])
-def test_recordings_become_figures(kind, recording, tmp_path, capsys):
-    """1200 pixels wide, the same bytes twice, and the answer says what is on it."""
+def test_recordings_become_figures(kind, recording, drawn, tmp_path, capsys):
+    """1200 pixels wide, the same bytes twice, as it always looked, and the answer says what is on it."""
     outs = [tmp_path / f"{i}.png" for i in (1, 2)]
     for out in outs:
         assert main(["figure", kind, str(recording), "--out", str(out)]) == 0
     data = outs[0].read_bytes()
     assert data == outs[1].read_bytes()
     assert _size(data)[0] == 1200
+    pictures.hold(kind, drawn[:1])
     said = capsys.readouterr().out
     assert ("2 arm poses" if kind == "acquisition" else "after alignment") in said
 
 
 @pytest.mark.parametrize("kind", ["depth", "normals"])
-def test_datasets_become_figures(kind, dataset, tmp_path, capsys):
-    """With a prediction and without; a prediction changes the picture."""
+def test_datasets_become_figures(kind, dataset, drawn, tmp_path, capsys):
+    """With a prediction and without; a prediction changes the picture, which looks as it did."""
     words = ["figure", kind, str(dataset), "--out"]
     outs = [tmp_path / f"{i}.png" for i in (1, 2)]
     given = ["--prediction", str(dataset.parent / "predictions")]
@@ -88,6 +90,7 @@ def test_datasets_become_figures(kind, dataset, tmp_path, capsys):
     data = [out.read_bytes() for out in outs]
     assert data[0] != data[1]
     assert {_size(d)[0] for d in data} == {1200}
+    pictures.hold(kind, drawn)
     assert "2 scenes, scale of errors" in capsys.readouterr().out
 
 

@@ -17,6 +17,7 @@ pytest.importorskip("matplotlib")
 import h5py
 import torch
 
+from tests import pictures
 from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, FormatError
@@ -209,11 +210,26 @@ def parts(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def page(parts, tmp_path_factory):
+def charts():
+    """Pixels of the charts of the whole page."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def page(parts, charts, tmp_path_factory):
     """The whole page."""
-    return write_report(**parts, out=tmp_path_factory.mktemp("out") / "report.html").read_text(
-        encoding="utf-8"
-    )
+    out = tmp_path_factory.mktemp("out") / "report.html"
+    with pytest.MonkeyPatch.context() as patch:
+        seen = pictures.watch_matplotlib(patch)
+        write_report(**parts, out=out)
+    charts += seen
+    return out.read_text(encoding="utf-8")
+
+
+def test_page_looks_as_it_did(page, charts):
+    """Charts of rig and loss, and every picture of the sensor and of ground truth."""
+    pictures.hold("report", charts)
+    pictures.hold("report-views", pictures.of_page(page))
 
 
 class Tags(HTMLParser):

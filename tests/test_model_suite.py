@@ -16,6 +16,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from tests import answers
 from tests.analytic import make_dataset
 from tests.test_model_baselines import target
 from tests.test_model_networks import frame
@@ -84,6 +85,13 @@ def test_a_suite_writes_its_tables_and_every_number(dataset, runs, tmp_path, cap
     results = json.loads((tmp_path / "r.json").read_text())
     assert list(results["methods"]) == ["sensor", "lf2", "compact", "coarse-fine"]
     assert list(results["spread"]) == ["compact"]
+    untrained = {name: results["methods"][name] for name in ("sensor", "lf2")}
+    answers.hold(
+        "evaluate",
+        {**results, "methods": untrained},
+        without=("spread", "runs", "manifest_sha256"),
+        names=[(dataset, "DATASET")],
+    )
     compact = results["methods"]["compact"]
     assert 0 <= compact["extra"]["coverage_1sigma"] <= 1
     assert compact["extra"]["precision"] > 0

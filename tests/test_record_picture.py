@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests import pictures
 from tests.test_plan import RIG, STAGE, UR10E
 from tofcapture.cli import main
 from tofcapture.errors import BusyError, DeviceError
@@ -29,7 +30,7 @@ def _drawn(plan, tmp_path, stage=STAGE, title="mug <1>"):
     return ET.fromstring(out.read_text())  # noqa: S314  ours
 
 
-def test_every_view_and_every_reason_is_drawn(tmp_path):
+def test_every_view_and_every_reason_is_drawn(drawn, tmp_path):
     """Each view stands in both panels with its number, place and words; the counts of the legend are those of the plan."""
     plan = _plan(turns=2)
     root = _drawn(plan, tmp_path)
@@ -47,6 +48,7 @@ def test_every_view_and_every_reason_is_drawn(tmp_path):
     for reason, count in plan.refused.items():
         assert (f"{count} {REMEDIES[reason][0]}" in words) == (count > 0)
     assert {"object turned by 0 deg", "object turned by 180 deg"} <= set(words)
+    pictures.hold("plan", drawn)
 
 
 def test_views_are_drawn_to_scale(tmp_path):

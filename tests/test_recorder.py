@@ -8,6 +8,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from tests import answers
 from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.devices.kinematics import HOME, MODELS, forward
@@ -22,7 +23,7 @@ from tofcapture.record.journal import Journal, journal_path
 from tofcapture.record.plan import object_sampling
 from tofcapture.record.recorder import record
 from tofcapture.record.resources import hold_file
-from tofcapture.rig import Rig
+from tofcapture.rig import Rig, dumps_rig
 
 TOF, STEREO = Camera(8, 6, 7.0, 7.0, 3.5, 2.5), Camera(10, 8, 9.0, 9.0, 4.5, 3.5)
 RIG = Rig(TOF, STEREO, transform(np.eye(3), [-0.05, 0.08, 0.0]), transform(np.eye(3), [0.0, -0.035, 0.08]))
@@ -388,6 +389,13 @@ def test_command_records_the_simulated_station(tmp_path, capsys):
     assert _arrays(tmp_path / "a", "calibration") == _arrays(tmp_path / "b", "calibration")
     view = read_view(view_path(tmp_path / "a", "calibration", 0))
     assert view.truth is not None
+    told = {
+        "quality": view.provenance["quality"],
+        "joints": view.arm_before.joints,
+        "times": view.tof.time_ns,
+    }
+    states = [view.arm_before.time_ns, view.arm_after.time_ns, view.stereo.time_ns]
+    answers.hold("record", {**told, "states": states, "rig": dumps_rig(view.rig).splitlines()}, off=0.03)
     assert np.isfinite(view.truth.depth).mean() > 0.9
 
 

@@ -4,11 +4,16 @@ Numbers, not digests: the last bits of sines differ between machines. A change h
 ``tofcapture.devices.sim.VERSION`` with it.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tests.test_sim_world import SMALL
+from tofcapture.devices.kinematics import HOME, MODELS
+from tofcapture.devices.registry import StationContext
 from tofcapture.devices.sim.config import read_constants
+from tofcapture.devices.sim.drivers import SimArm, SimOperator, SimStereo, SimTof
 from tofcapture.devices.sim.scenes import scene_objects
 from tofcapture.devices.sim.shapes import FAMILIES
 from tofcapture.devices.sim.world import SimWorld
@@ -76,6 +81,11 @@ def test_measurements_of_a_seed():
     world = SimWorld(read_constants(SMALL, "test"), 5, scene_objects)
     world.place("mug")
     world.set_pose(look_at([0.3, 0.2, 0.3], [0.7, 0.0, -0.4]), b"pose")
+    light = world.light()
+    sums = [checksum(part) for part in (light.phasor.real, light.phasor.imag, light.steady)]
+    assert sums == pytest.approx([-0.13307733, 0.07112404, -0.03828060], abs=3e-4)
+    assert light.steady.mean() == pytest.approx(0.37338298, rel=1e-4)
+    assert np.abs(light.phasor).mean(axis=(1, 2)) == pytest.approx([0.34554366, 0.34548458], rel=1e-4)
     points = world.stereo(lambda: 0).points
     there = np.isfinite(points[..., 2])
     assert there.sum() == pytest.approx(2956, abs=3)
@@ -95,3 +105,20 @@ def test_measurements_of_a_seed():
     assert world.nominal_rig().T_tof_stereo[:3, 3] == pytest.approx(
         [-0.04912699168806, 0.07500575175137, 0.00480362891128], abs=1e-12
     )
+
+
+def test_a_simulated_station_keeps_time():
+    """A move takes what the farthest joint takes at the arm's speed, and half a second; frames come 30 a second, readings later."""
+    station = {**SMALL, "seed": 5, "render": {**SMALL["render"], "multipath": False}}
+    context = StationContext({"sim": station}, Path())
+    goal = HOME + np.array([0.3, 0.0, -0.5, 0.0, 0.1, 0.0])
+    with SimArm({"model": "ur5e"}, context) as arm, SimOperator({}, context) as operator:
+        operator.place("mug")
+        arrived = [arm.move_to(goal), arm.move_to(goal)]
+        burst = SimTof({}, context).capture(4)
+        points = SimStereo({}, context).capture()
+    assert arrived[0].time_ns == pytest.approx(1e9 * (0.5 / MODELS["ur5e"].speed + 0.5 + 0.5), abs=1)
+    assert arrived[0].time_ns == arrived[1].time_ns
+    assert np.diff(burst.time_ns) == pytest.approx([1e9 / 30] * 3, abs=1.5)
+    assert arrived[0].time_ns < burst.time_ns[0]
+    assert burst.time_ns[-1] < points.time_ns

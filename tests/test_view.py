@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests import PATIENCE, until
+from tests import PATIENCE, pictures, until
 from tests.test_files_shard import RIG, write
 from tofcapture.cli import main
 from tofcapture.colours import GOOD, GREY, MASK, Scale, palette, scale_for
@@ -157,9 +157,8 @@ def test_views_are_thinned_evenly():
     assert source.spread(200) == list(range(100))
 
 
-def test_contact_sheets_are_1200_wide(dataset, calibration, prediction, tmp_path, capsys):
-    """All kinds become PNG of 1200 pixels; the same input gives the same bytes."""
-    pytest.importorskip("matplotlib")
+def test_contact_sheets_are_1200_wide(dataset, calibration, prediction, drawn, tmp_path, capsys):
+    """All kinds become PNG of 1200 pixels; the same input gives the same bytes, and they look as they did."""
     for path in (dataset, calibration / "rig.toml", prediction):
         sheets = [tmp_path / f"{i}.png" for i in (1, 2)]
         for sheet in sheets:
@@ -167,6 +166,7 @@ def test_contact_sheets_are_1200_wide(dataset, calibration, prediction, tmp_path
         data = sheets[0].read_bytes()
         assert int.from_bytes(data[16:20]) == 1200
         assert data == sheets[1].read_bytes()
+    pictures.hold("sheet", drawn[::2])
     assert "3 of 4 views" in capsys.readouterr().out
 
 
