@@ -122,7 +122,13 @@ def test_stated_covariances_that_are_too_small_are_scaled():
     rng = np.random.default_rng(4)
     arm = arms(rng, 20)
     fits = [replace(f, covariance=f.covariance / 25) for f in fits_of(arm, rng)]
-    assert 3 < np.sqrt(solve_bundle(arm, fits, (1e-5, 1e-5)).variance) < 8
+    bundle = solve_bundle(arm, fits, (1e-5, 1e-5))
+    assert 3 < np.sqrt(bundle.variance) < 8
+    told = solve_bundle(
+        arm, fits_of(arm), (1e-5, 1e-5)
+    )  # of the fits as they should be, whose scatter is none
+    wider = np.sqrt(np.diag(bundle.covariance) / np.diag(told.covariance))
+    np.testing.assert_allclose(wider, np.sqrt(bundle.variance) / 5, rtol=0.5)
 
 
 @pytest.mark.parametrize(

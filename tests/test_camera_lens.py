@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests import answers
 from tofcapture import poses
 from tofcapture.camera import Camera, lens_coefficients
 from tofcapture.errors import ConfigError
@@ -147,6 +148,9 @@ def test_ground_truth_follows_the_lens():
     front = (m @ (T[:3, :3] @ [0, 0, 0.6] + T[:3, 3])) / (LENS.rays @ m)
     good = np.isfinite(found.depth) & ~found.edge & ~found.occluded
     assert good.mean() > 0.5
+    assert 0.55 < np.nanmin(found.depth) < np.nanmax(found.depth) < np.nanmax(wall) + 0.01
+    told = {name: int(getattr(found, name).sum()) for name in ("edge", "occluded")}
+    answers.hold("lens-projection", {**told, "depth": float(np.nanmean(found.depth))}, off=2e-3)
     off = np.minimum(np.abs(found.depth - wall), np.abs(found.depth - front))
     assert off[good].max() < 1e-5
     points = poses.transform_points(poses.invert(T), (found.depth[..., None] * LENS.rays)[good])

@@ -183,6 +183,12 @@ def test_four_times_agrees_with_the_exact_depth(fine, sample, view):
             np.testing.assert_array_equal(a, b)
 
 
+def test_scales_may_be_a_list():
+    """As JSON and command lines give them; the config is the same one, and can be a key."""
+    assert hash(SampleConfig(scales=[1, 2])) == hash(SampleConfig())
+    assert SampleConfig(scales=[1, 2]) == SampleConfig()
+
+
 def test_only_known_scales_are_made():
     """1 and 2 are always there, and nothing but 4 comes beside them."""
     for scales in ((1, 4), (4, 2, 1), (1, 2, 3), ()):

@@ -11,6 +11,8 @@ import pytest
 from tests import PATIENCE
 from tofcapture.cli import doctor, main, probe
 from tofcapture.cli.probe import Finding
+from tofcapture.devices import TofCamera
+from tofcapture.errors import DeviceError
 
 PLAN = '[operator]\ndriver = "sim"\n[plan]\ntable = -0.5\ntarget = [0.7, 0, -0.4]\nboard = [0.7, 0, -0.2]\nboard_normal = [0, 0, 1]\n'
 
@@ -128,6 +130,19 @@ def test_broken_stations(tmp_path):
     text = text.replace('"moon"', f'"tof_serial"\nport = "{tmp_path}/ttyUSB0"')
     (port,) = [f for f in _station(tmp_path, text) if (f.what, f.verdict) == ("tof", "FAIL")]
     assert "plug it in" in port.advice
+
+
+def test_a_device_that_cannot_be_described_is_told_of_once(monkeypatch, tmp_path):
+    """What it is, is not known before it was opened; nothing is said to pass that nobody looked at."""
+
+    class Shy(TofCamera):
+        def describe(self):
+            raise DeviceError("not opened yet", hint="open it")
+
+    monkeypatch.setattr("tofcapture.devices.registry.make_device", lambda role, _: Shy())
+    text = "".join(f'[{role}]\ndriver = "sim"\n' for role in ("arm", "tof", "stereo"))
+    found = [(f.what, f.verdict, f.found, f.advice) for f in _station(tmp_path, text + PLAN)]
+    assert [f for f in found if f[0] == "tof"] == [("tof", "WARN", "not opened yet", "open it")]
 
 
 def test_a_station_of_real_devices_before_its_first_day(tmp_path):

@@ -19,9 +19,11 @@ from tofcapture.files.shard import GroundTruth
 from tofcapture.files.view import view_path, write_view
 from tofcapture.poses import look_at
 from tofcapture.rig import dumps_rig
+from tofcapture.viz import open_source
 from tofcapture.viz.figures.preprocessing import gap, preprocess
 from tofcapture.viz.figures.scenes import Maps, read_rows
 from tofcapture.viz.shots import eye_for, splat
+from tofcapture.viz.sources import scene_views
 
 pytest.importorskip("matplotlib")
 
@@ -155,6 +157,21 @@ def test_scales_end_at_round_numbers():
         assert value <= round_up(value) <= 1.7 * value
     assert round_up(0.0) == round_up(float("nan")) == 1.0
     assert percentile([np.array([np.nan])], 50, 3.0) == 3.0
+
+
+def test_a_recording_of_the_board_alone_is_drawn(recording, tmp_path):
+    """Where no scene is, the board is what there is to see."""
+    copied = tmp_path / "board"
+    shutil.copytree(recording / "views/calibration", copied / "views/calibration")
+    assert [p.name for p in scene_views(copied)] == ["view-000.h5"]
+    assert main(["figure", "acquisition", str(copied), "--out", str(tmp_path / "x.png")]) == 0
+    kinds = [(panel.title, panel.kind) for panel in open_source(copied).load(0).panels]
+    assert kinds == [
+        ("ToF amplitude", "amplitude"),
+        ("ToF depth", "depth"),
+        ("stereo depth", "depth"),
+        ("exact depth (simulated)", "depth"),
+    ]
 
 
 def test_nearer_points_cover_farther_ones():

@@ -199,10 +199,13 @@ def test_the_reader_pickles_and_survives_a_fork(tmp_path):
     if hasattr(os, "fork"):
         context = multiprocessing.get_context("fork")
         queue = context.SimpleQueue()
-        child = context.Process(target=_raw_sum, args=(reader, queue))
-        child.start()
-        assert queue.get() == expected
-        child.join()
+        children = [context.Process(target=_raw_sum, args=(reader, queue)) for _ in range(3)]
+        for child in children:
+            child.start()
+        assert {_raw_sum(reader) for _ in range(50)} == {expected}  # while the others read
+        assert {queue.get() for _ in children} == {expected}
+        for child in children:
+            child.join()
     assert _raw_sum(reader) == expected
     reader.close()
     assert _raw_sum(reader) == expected

@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 
 torch = pytest.importorskip("torch")
 
@@ -61,7 +62,7 @@ def pair(surface, mask, shape, seed=0):
 def brute(p, q, p_mask, q_mask, shift):
     """Squared distances of all pairs (N, M), float64."""
     a, b = (c.detach().double().numpy()[:, m.numpy()].T for c, m in ((p, p_mask), (q, q_mask)))
-    return (((a + shift.double().numpy())[:, None] - b[None]) ** 2).sum(-1)
+    return cdist(a + shift.double().numpy(), b, "sqeuclidean")
 
 
 def check(engine, clouds, device="cpu", shifts=SHIFTS):

@@ -317,6 +317,7 @@ def test_same_inputs_same_bytes(parts, page, tmp_path):
     before = torch.get_num_threads()
     torch.set_num_threads(3 - min(before, 2))
     again = write_report(**parts, out=tmp_path / "b" / "b.html")
+    assert torch.get_num_threads() == 3 - min(before, 2)
     torch.set_num_threads(before)
     assert again.read_text(encoding="utf-8") == page
 

@@ -48,8 +48,9 @@ def station(tmp_path_factory):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """An uninterrupted run of two multipath scenes."""
-    out = tmp_path_factory.mktemp("whole") / "data"
-    simulate_dataset(spec(), out, jobs=1)
+    out, told = tmp_path_factory.mktemp("whole") / "data", []
+    simulate_dataset(spec(), out, jobs=1, progress=lambda *views: told.append(views))
+    assert told == [(0, 4), (2, 4), (4, 4)]  # views that are done, of all
     return out
 
 

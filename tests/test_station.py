@@ -223,6 +223,24 @@ def test_simulated_station_opens():
     assert first["arm"]["model"] == "ur10e"
 
 
+def test_what_a_driver_may_leave_out():
+    """An arm is real and an operator no person until a driver says so; nobody turns; nothing is found without a probe."""
+
+    class Silent(TofCamera, Arm, Operator):
+        pass
+
+    device = Silent()
+    assert (device.simulated, device.person, device.can_turn, device.probe(), device.truth()) == (
+        *(False, False, False),
+        *("", None),
+    )
+    assert device.watch(1.0) is device.equip(None) is device.interrupt() is None
+    with device as same:
+        assert same is device
+    with pytest.raises(DeviceError, match=r"nobody can turn 'mug' by 0\.50 rad"):
+        device.turn("mug", 0.5)
+
+
 def test_console_operator(tmp_path):
     """The person is asked once per scene, on the given stream; ended input is an error; nobody knows the truth."""
     ask, context = io.StringIO(), StationContext({}, tmp_path)

@@ -3,6 +3,7 @@
 import http.client
 import json
 import shutil
+import sys
 import threading
 import time
 from pathlib import Path
@@ -16,6 +17,7 @@ from tests import PATIENCE, pictures, until
 from tests.test_files_shard import RIG, write
 from tofcapture.cli import main
 from tofcapture.colours import GOOD, GREY, MASK, Scale, palette, scale_for
+from tofcapture.errors import DeviceError
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
 from tofcapture.rig import dumps_rig
@@ -203,6 +205,79 @@ def test_what_cannot_be_shown_is_said(make, code, tmp_path, capsys):
 def _text(path, text, encoding="utf-8"):
     path.write_bytes(text.encode(encoding))
     return path
+
+
+PROGRAM = """#!{python}
+import http.server, os, sys
+port = int(sys.argv[sys.argv.index("--web-viewer-port") + 1])
+assert "--serve-web" in sys.argv and sys.argv[sys.argv.index("--bind") + 1] == "127.0.0.1"
+os.chdir({folder!r})
+http.server.HTTPServer(("127.0.0.1", port), http.server.SimpleHTTPRequestHandler).serve_forever()
+"""
+
+
+@pytest.fixture
+def pretended(tmp_path, monkeypatch):
+    """A program that serves a page as Rerun's does; the page loads a font from elsewhere."""
+    assets = tmp_path / "assets"
+    assets.mkdir()
+    for name in ("re_viewer.js", "re_viewer_bg.wasm", "favicon.ico"):
+        (assets / name).write_text(name)
+    fonts = '<link rel="stylesheet" href="https://fonts.example/x.css">'
+    (assets / "index.html").write_text(f"<html><head>{fonts}</head><body></body></html>")
+    program = tmp_path / "rerun"
+    program.write_text(PROGRAM.format(python=sys.executable, folder=str(assets)))
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+
+
+@pytest.mark.usefixtures("pretended")
+def test_the_page_is_rerun_s_and_asks_nobody_else(tmp_path):
+    """Every file comes from the program's own server, which is gone afterwards; what lies elsewhere is not loaded."""
+    from tofcapture.viz.web import page_server
+
+    rrd, before = tmp_path / "x.rrd", _servers()
+    rrd.write_bytes(b"RRF2 and more")
+    with page_server(rrd, 0) as server:
+        until(lambda: _servers() <= before)
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        link = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
+        answers = {}
+        for path in ("/", "/index.html", "/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/view.rrd"):
+            link.request("GET", path)
+            answer = link.getresponse()
+            answers[path] = answer.status, answer.read()
+            assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+            where = answer.headers.get("Location", "")
+            assert (f"url=http://127.0.0.1:{server.server_port}/view.rrd" in where) == (path == "/")
+        link.request("GET", "/", headers={"Host": "evil.example:80"})
+        assert link.getresponse().status == 403
+        link.close()
+        server.shutdown()
+        thread.join()
+    assert {path: status for path, (status, _) in answers.items()} == {
+        p: 303 if p == "/" else 200 for p in answers
+    }
+    assert answers["/view.rrd"][1] == b"RRF2 and more"
+    assert answers["/re_viewer.js"][1] == b"re_viewer.js"
+    page = answers["/index.html"][1].decode()
+    assert "fonts.example" not in page
+    assert page.startswith("<html><head><script>\nconst own = window.fetch;")
+
+
+def test_a_program_that_never_answers_is_given_up(monkeypatch, tmp_path):
+    """The reason is said, and what to do instead."""
+    from tofcapture.viz import web
+
+    program = tmp_path / "rerun"
+    program.write_text(f"#!{sys.executable}\nimport time; time.sleep(600)\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(web, "_PATIENCE", 0.5)
+    with pytest.raises(DeviceError, match="did not come") as caught, web.page_server(tmp_path / "x.rrd", 0):
+        pass
+    assert "--png" in caught.value.hint
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@
 
 from __future__ import annotations
 
-import os
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -150,7 +149,9 @@ def scales_text(scales: Sequence[int]) -> str:
 
 
 class ShardReader:
-    """Reads one shard; opens on first use, keeps its handles, pickles as its path, reopens after a fork.
+    """Reads one shard; opens on first use, keeps its handles, pickles as its path.
+
+    A reader in use may cross a fork: HDF5 reads by position, so that processes share no offset.
 
     Parameters
     ----------
@@ -174,7 +175,6 @@ class ShardReader:
     def _closed(self) -> None:
         self._file: h5py.File | None = None
         self._datasets: dict[str, h5py.Dataset] = {}
-        self._pid = -1
 
     def __getstate__(self) -> dict[str, Any]:
         return {"path": self.path, "sha256": self._sha256, "known": remembered(self.path)}
@@ -194,16 +194,15 @@ class ShardReader:
 
     def close(self) -> None:
         """Close the file; the next use opens it again."""
-        if self._file is not None and self._pid == os.getpid():
+        if self._file is not None:
             self._file.close()
         self._closed()
 
     def _open(self) -> h5py.File:
-        if self._file is None or self._pid != os.getpid():
+        if self._file is None:
             if self.path.is_file():
                 verify(self.path, self._sha256)
-            # A handle that crossed a fork shares its file offset with the parent: leave it alone and open anew.
-            self._file, self._datasets, self._pid = open_checked(self.path, SHARD), {}, os.getpid()
+            self._file = open_checked(self.path, SHARD)
         return self._file
 
     def _dataset(self, name: str) -> h5py.Dataset:
