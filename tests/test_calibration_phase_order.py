@@ -188,7 +188,7 @@ def test_command_finds_and_writes(tmp_path):
     np.testing.assert_allclose(written["phase_rad"], theta)
     for k, line in enumerate(outcome.text.splitlines()[1:9]):
         assert [float(x) for x in line.split()] == [k, hz[k] / 1e6, round(np.degrees(theta[k]))]
-    answers.hold("phase-order", {"data": written, "text": outcome.text})
+    answers.hold("phase-order", {"data": written, "text": outcome.text}, names=[(tmp_path, "FOLDER")])
     three, far, *_ = made(6, (60e6,), phases=(3,))
     np.savez(tmp_path / "three.npz", **{f"phase{k}": three[:, k] for k in range(3)})
     np.save(tmp_path / "far.npy", far)

@@ -165,15 +165,15 @@ def test_help_fits_a_terminal_of_eighty_columns(name, monkeypatch):
 
 def test_options_are_what_scripts_rely_on():
     """Names, defaults, numbers of values and choices of every option of every command; there may be more of them."""
-    answers.hold("options", {name: _options(parser({name: c})) for name, c in COMMANDS.items()})
+    answers.hold("options", {name: _taken(parser({name: c})) for name, c in COMMANDS.items()})
 
 
-def _options(given):
+def _taken(given):
     """What a parser takes, those of its commands included; its words apart."""
     found = {}
     for action in given._actions:
         if isinstance(action.choices, dict):
-            found |= {name: _options(sub) for name, sub in action.choices.items()}
+            found |= {name: _taken(sub) for name, sub in action.choices.items()}
             continue
         if action.default is argparse.SUPPRESS:  # --help and --version
             continue
