@@ -82,7 +82,7 @@ def scene_views(recording: Path, scene: str | None = None) -> list[Path]:
     found = scenes_of(recording)
     if scene is not None and scene not in found:
         raise DataError(f"{recording}: no scene {scene}", hint=f"it has {', '.join(found)}")
-    name = scene or next((n for n in found if n != BOARD_SCENE), found[0])
+    name = scene or next((n for n in found if n != BOARD_SCENE), BOARD_SCENE)
     return found[name]
 
 
