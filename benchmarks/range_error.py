@@ -17,6 +17,7 @@ import numpy as np
 
 from calibration.range_error.fit import RangeFit, fit_ranges
 from calibration.range_error.views import Seen, seen_of
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.devices.sim.config import Constants, read_constants
 from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects
 from tofcapture.devices.sim.world import SimWorld
@@ -24,7 +25,7 @@ from tofcapture.errors import QualityError, TofError
 from tofcapture.frames import ArmState, View
 from tofcapture.ops.phase import radius_px
 from tofcapture.poses import Float64, exp, invert, look_at, rotation_exp
-from tofcapture.rig import SPEED_OF_LIGHT, RangeError, image_places
+from tofcapture.rig import RangeError, image_places
 
 LAMP = {"half_angle": 0.70, "edge": 0.17}
 ERRORS = (

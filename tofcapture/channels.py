@@ -35,7 +35,7 @@ def ambiguity(modulation_hz: float) -> float:
     return SPEED_OF_LIGHT / (2 * modulation_hz)
 
 
-def design(phase_rad: Sequence[float], *, offset: bool) -> Float64:
+def design(phase_rad: Sequence[float] | NDArray[np.floating], *, offset: bool) -> Float64:
     """Build the matrix (n, 3 or 2) that makes taps of ``B``, ``A cos phi`` and ``-A sin phi``; without an offset of the last two."""
     theta = np.asarray(phase_rad, dtype=np.float64)
     columns = [np.ones(len(theta))] * offset + [np.cos(theta), np.sin(theta)]
@@ -159,7 +159,9 @@ class WrapTable(NamedTuple):
     apart: float  #: closest two vectors, as :data:`TOLD_APART` counts; infinite when there is one
 
 
-def wrap_table(hz: Sequence[float], information: Sequence[float], reach: Reach | None = None) -> WrapTable:
+def wrap_table(
+    hz: Sequence[float], information: Sequence[float] | Float64, reach: Reach | None = None
+) -> WrapTable:
     """List the wrap vectors of frequencies (F,) that ranges of the ``reach``, metres, and some noise may show.
 
     ``information`` (F,) is that of each phasor per power and tap variance: half the number of phases where they are evenly
@@ -195,7 +197,7 @@ def parse_reach(value: object, where: str) -> Reach | None:
     if value is None:
         return None
     try:
-        low, high = value  # type: ignore[misc]
-        return float(low), float(high)
+        low, high = map(float, value)  # type: ignore[call-overload]
     except (TypeError, ValueError) as err:
         raise ConfigError(f"{where}: reach: expected two ranges in metres, got {value!r}") from err
+    return low, high

@@ -73,8 +73,8 @@ class TofInfo:
         """Tell which taps, any shape, reached saturation, of either sign, or hold a flag beyond it."""
         # Integers are compared with an integer: not one of them is converted.
         limit = self.saturation if raw.dtype.kind == "f" else math.ceil(self.saturation)
-        out: NDArray[np.bool_] = raw >= limit
-        return out if raw.dtype.kind == "u" else out | (raw <= -limit)
+        above = np.asarray(raw >= limit)
+        return above if raw.dtype.kind == "u" else above | np.asarray(raw <= -limit)
 
 
 @dataclass(frozen=True)

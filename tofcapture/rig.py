@@ -92,7 +92,7 @@ class RangeError:
         table = unpacked_table(self.table)
         H, W = table.shape
         rows, columns = (np.rint((s + 1) / 2 * (n - 1)).astype(np.intp) for s, n in ((y, H), (x, W)))
-        return smooth + table[rows, columns]
+        return np.asarray(smooth + table[rows, columns])
 
     def _of_amplitude(self, amplitude: NDArray[np.floating] | None) -> Float64 | float:
         if not self.per_inverse_amplitude:
@@ -115,7 +115,7 @@ def unpacked_table(text: str) -> Float64:
     """Read what :func:`packed_table` wrote; :class:`ConfigError` for anything but finite metres (H, W)."""
     try:
         held = io.BytesIO(zlib.decompress(base64.b64decode(text, validate=True)))
-        table = np.load(held, allow_pickle=False).astype(np.float64)
+        table: Float64 = np.load(held, allow_pickle=False).astype(np.float64)
     except (ValueError, zlib.error, EOFError, OSError) as err:
         raise ConfigError(f"range_error: table: expected base64 of a compressed .npy: {err}") from err
     if table.ndim != 2 or not np.isfinite(table).all():

@@ -28,10 +28,11 @@ from calibration.registration.gate import (
 )
 from calibration.registration.pairs import Pair
 from tofcapture.camera import Camera
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.errors import QualityError, TofError
 from tofcapture.pool import Pool
 from tofcapture.poses import Float64, invert, transform_points
-from tofcapture.rig import SPEED_OF_LIGHT, RangeError
+from tofcapture.rig import RangeError
 
 MIN_PAIRS = 3  # below this no pair can be told from an outlier
 REFINEMENTS = 2  # rounds of range residual and registration after the first; a third changes 0.1 mm

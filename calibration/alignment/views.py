@@ -19,10 +19,11 @@ from calibration.registration.clouds import (
 )
 from calibration.registration.rims import ACROSS, Rims, lit_rims, square_rims, unveiled_rims
 from tofcapture.camera import Camera
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.frames import View
 from tofcapture.ops import phase
 from tofcapture.poses import Float64
-from tofcapture.rig import SPEED_OF_LIGHT, RangeError
+from tofcapture.rig import RangeError
 
 STRIDE = 5  # surface pixels skipped; thousands a view remain, and their common bias is not lowered by more
 RIM_BESIDE = TOF_MARGIN + ACROSS + 1  # px that a rim may lie off its board's trusted pixels

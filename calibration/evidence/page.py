@@ -18,11 +18,12 @@ from calibration.registration.gate import residuals
 from calibration.registration.pairs import calibration_views
 from calibration.registration.rims import rim_cloud, stereo_rims, tof_rims
 from tofcapture.camera import Camera
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.colours import Scale
 from tofcapture.frames import View
 from tofcapture.poses import Float64, check_transform, invert, transform
 from tofcapture.record.quality import CELLS, coverage
-from tofcapture.rig import SPEED_OF_LIGHT, range_error_from
+from tofcapture.rig import range_error_from
 from tofcapture.viz import page as charts
 from tofcapture.viz.page import write_page
 

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.errors import DataError, QualityError
 from tofcapture.ops.phase import frequencies
 from tofcapture.poses import Float64
-from tofcapture.rig import SPEED_OF_LIGHT
 
 Complex128 = NDArray[np.complex128]
 Block = tuple[int, ...]  # channels of one frequency, in the order of their phases

@@ -17,11 +17,12 @@ import numpy as np
 from calibration.range_error.terms import IMAGE, ORDERS, Terms, jackknife, waves
 from calibration.range_error.views import RangeView, Seen, common_camera, range_view, wrapped
 from tofcapture.camera import Camera
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.errors import DataError, QualityError
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import frequencies, radius_px
 from tofcapture.poses import Float64, exp, invert, transform, transform_points
-from tofcapture.rig import SPEED_OF_LIGHT, RangeError, image_places
+from tofcapture.rig import RangeError, image_places
 
 MIN_VIEWS = 6
 LOOSE = np.array([0.005] * 3 + [0.005] * 3)  # m, rad: one sigma of a rig transform nobody vouches for

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.poses import Float64
-from tofcapture.rig import SPEED_OF_LIGHT, RangeError
+from tofcapture.rig import RangeError
 
 ORDERS = (1, 2, 4)  # the slow first one and the even orders of a square-wave light
 IMAGE = ("image 10", "image 01", "image 20", "image 11", "image 02")

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from calibration.registration.clouds import TOF_MARGIN, Mask, dilate, plane_departure, range_sigma
 from tofcapture.camera import Camera
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.errors import DataError
 from tofcapture.frames import TofInfo, View
 from tofcapture.ops import phase
 from tofcapture.ops.normals import PlaneField
 from tofcapture.ops.project import project, triangulate
 from tofcapture.poses import Float64
-from tofcapture.rig import SPEED_OF_LIGHT
 
 JUMP = 0.004  # m; departure of the surface from its neighbours that marks a depth edge
 WINDOW = 2.5  # px of the ToF image on either side whose stereo points make a pixel's plane
@@ -69,7 +69,7 @@ def seen_of(view: View, name: str) -> Seen:
         phasor=phase.mean_phasors(
             burst.raw, burst.info.modulation_hz, burst.info.phase_rad, offset=burst.info.offset
         ),
-        saturated=burst.info.saturated(burst.raw).any(axis=(0, 1)),
+        saturated=np.asarray(burst.info.saturated(burst.raw).any(axis=(0, 1))),
         sigma=range_sigma(burst),
         celsius=float(celsius.mean()) if len(celsius) else float("nan"),
         stereo=view.stereo.info.camera,

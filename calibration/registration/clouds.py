@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.frames import StereoFrame, TofBurst
 from tofcapture.ops import phase
 from tofcapture.poses import Float64
-from tofcapture.rig import SPEED_OF_LIGHT
 
 Mask = NDArray[np.bool_]
 

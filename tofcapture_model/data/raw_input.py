@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tofcapture.camera import Camera
 from tofcapture.channels import channels_in_words, frequencies, mismatch, wrap_table
 from tofcapture.errors import ConfigError, DataError, UnreadableError
-from tofcapture.frames import TofInfo
+from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
 from tofcapture.ops.phase import Decoder, information
 from tofcapture.ops.phase.float32 import tap_rows
 from tofcapture.rig import RangeError, load_rig
@@ -158,12 +158,14 @@ def _described(
     said = {
         k: held[k].reshape(-1) for k in ("modulation_hz", "phase_rad", "offset", "saturation") if k in held
     }
+    limit = said.get("saturation", [SATURATION])[0] if saturation is None else saturation
     try:
-        channels = {k: tuple(map(float, said[k])) for k in ("modulation_hz", "phase_rad") if k in said}
-        limit = SATURATION if saturation is None else saturation
         return TofInfo(
-            "array", "", camera, np.zeros(3), **channels, offset=bool(said.get("offset", [True])[0]),
-            saturation=float(said["saturation"][0]) if "saturation" in said and saturation is None else limit,
+            "array", "", camera, np.zeros(3),
+            tuple(map(float, said.get("modulation_hz", PAPER_MODULATION_HZ))),
+            tuple(map(float, said.get("phase_rad", PAPER_PHASE_RAD))),
+            saturation=float(limit),
+            offset=bool(said.get("offset", [True])[0]),
         )  # fmt: skip
     except DataError as err:
         raise DataError(f"{path}: {err.message}", err.hint) from err

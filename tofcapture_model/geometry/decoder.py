@@ -110,9 +110,8 @@ class TorchDecoder:
         rows = (self._rows[:, :, None, None] * raw).sum(1)
         real, imag = rows[:F], rows[F : 2 * F]
         amplitude = (real.square() + imag.square()).sqrt()
-        ranges = torch.stack(
-            [r(*x, celsius) for r, *x in zip(self._range, real, imag, amplitude, strict=True)]
-        )
+        each = zip(self._range, real, imag, amplitude, strict=True)
+        ranges = torch.stack([range_(i, q, size, celsius) for range_, i, q, size in each])
         mean = rows[2 * F] if self._info.offset else amplitude[-1]
         variance = mean / self._noise.electrons_per_unit + (self._noise.read**2 + 1e-12)
         lit = amplitude.amin(0) > 0
@@ -178,10 +177,10 @@ class TorchDecoder:
         around = nn.functional.unfold(maps[None], size, padding=RADIUS).reshape(
             len(maps), size**2, *ranges.shape[1:]
         )
-        there, strength, seen = around.split([len(ranges), len(ranges), 1])
+        there, strength, seen = (around[: len(ranges)], around[len(ranges) : -1], around[-1])
         farther = (there[-1] - ranges[-1]) / U[-1]
         farther = farther - torch.floor(farther + 0.5)
-        alike = seen[0] * (0.5 + 0.5 * torch.cos(2 * math.pi * farther)).square()
+        alike = seen * (0.5 + 0.5 * torch.cos(2 * math.pi * farther)).square()
         angle = 2 * math.pi * (there - farther * U[-1]) / U[:, None]
         real, imag = ((strength * alike * wave(angle)).sum(1) for wave in (torch.cos, torch.sin))
         turns = torch.atan2(imag, real) / (2 * math.pi)

@@ -19,8 +19,8 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture.camera import Camera
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.errors import ConfigError
-from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.frame import Frame
 
 PINHOLE, LENS = 4, 12

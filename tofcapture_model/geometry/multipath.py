@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
-from tofcapture.rig import SPEED_OF_LIGHT
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture_model.geometry.maps import (
     pixel_slopes,
     plane_normals,

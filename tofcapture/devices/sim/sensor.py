@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.channels import SPEED_OF_LIGHT, solution
 from tofcapture.devices.sim.light import Light
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
 from tofcapture.ops.phase import Complex128, frequencies
-from tofcapture.ops.phase.phasors import solution
 from tofcapture.poses import Float64
-from tofcapture.rig import SPEED_OF_LIGHT, RangeError, image_places, radius_px
+from tofcapture.rig import RangeError, image_places, radius_px
 
 _FEW = 200.0  # electrons; below, shot noise is drawn from the Poisson distribution itself
 

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.devices.sim.scene import Caster, Float32, Geometry, Hits, Int64, lift
-from tofcapture.rig import SPEED_OF_LIGHT
 
 Complex64 = NDArray[np.complex64]
 

@@ -170,9 +170,11 @@ class Decoder:
         if not len(unsure):
             return
         shape = self.info.camera.shape
-        images = (x.reshape(*x.shape[:-1], *shape) for x in (self._ranges, self._power, self._variance, good))
-        chosen = (x.reshape(shape) for x in (self._which, self._doubt))
-        float32.ask(unsure, RADIUS, *images, self._lengths, self._weight, self._U.astype(np.float32), *chosen)
+        images = self._ranges.reshape(-1, *shape), self._power.reshape(-1, *shape)
+        float32.ask(
+            unsure, RADIUS, *images, self._variance.reshape(shape), good.reshape(shape), self._lengths, self._weight,
+            self._U.astype(np.float32), self._which.reshape(shape), self._doubt.reshape(shape),
+        )  # fmt: skip
 
     def _flags(self, saturated: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Raise all flags (H W,) but those of flying pixels."""

@@ -18,6 +18,7 @@ from tofcapture.libraries import compiled
 from tofcapture.rig import RangeError
 
 Float32 = NDArray[np.float32]
+Real = float | np.floating[Any]
 
 _TABLE = 1 << 14  # entries over one ambiguity: nearest is right to 5 micrometres for slopes of 0.1 at 100 MHz
 _MARGIN = 0.5  # of an ambiguity beyond what a frame may hold, so that any temperature is inside the table
@@ -105,7 +106,7 @@ def combine(raw: NDArray[Any], starts: Any, columns: Any, weights: Any, out: Flo
 
 
 @compiled
-def _turns(real: float, imag: float, size: float) -> float:
+def _turns(real: Any, imag: Any, size: Any) -> Any:
     """Compute the phase of a phasor in turns, [0, 1]: ``phi = 2 atan(imag / (size + |real|))``, on the left half a turn minus that."""
     t = imag / (size + abs(real) + _TINY)
     x = t * t
@@ -115,7 +116,7 @@ def _turns(real: float, imag: float, size: float) -> float:
 
 
 @compiled
-def _sine(turns: float) -> float:
+def _sine(turns: Any) -> Any:
     """Compute the sine of any number of turns."""
     t = turns - np.floor(turns + _HALF)
     t = _HALF - t if t > np.float32(0.25) else t
@@ -152,15 +153,17 @@ class Correction:
 
     def __call__(self, real: Float32, imag: Float32, celsius: float, power: Float32, out: Float32) -> None:
         """Turn phasors (N,) into power, raw units squared, and ranges in [0, R], metres."""
-        warm = self.per_kelvin * (celsius - self.reference)
+        drift = self.per_kelvin * (celsius - self.reference)
         table = np.array([self.start], np.float32) if self.plain else self.table
-        numbers = (self.R / self.step, warm, self.dark, self.step, self.R)
-        _ranges(real, imag, self.fixed, table, *map(np.float32, numbers), power, out)
+        steps, warm, dark, step, R = map(
+            np.float32, (self.R / self.step, drift, self.dark, self.step, self.R)
+        )
+        _ranges(real, imag, self.fixed, table, steps, warm, dark, step, R, power, out)
 
 
 @compiled
 def _ranges(
-    real: Float32, imag: Float32, fixed: Float32, table: Float32, steps: float, warm: float, dark: float, step: float, R: float,
+    real: Float32, imag: Float32, fixed: Float32, table: Float32, steps: Real, warm: Real, dark: Real, step: Real, R: Real,
     power: Float32, out: Float32,
 ) -> None:  # fmt: skip
     inverse = _ONE / R
@@ -184,7 +187,7 @@ def _ranges(
 
 @compiled
 def choose(
-    ranges: Float32, power: Float32, variance: Float32, lengths: Float32, weight: Float32, unit: Float32, limit: float,
+    ranges: Float32, power: Float32, variance: Float32, lengths: Float32, weight: Float32, unit: Float32, limit: Real,
     which: NDArray[np.int32], margin: Float32, doubt: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     """Choose the wrap vector of each pixel by maximum likelihood.
@@ -367,8 +370,8 @@ def ask(
 
 @compiled
 def finish(
-    ranges: Float32, which: Any, lengths: Float32, lean: Float32, start: float, period: float, length: Float32, slant: Float32,
-    quarter: float, nearest: float, bad: Any, depth: Float32, rounds: Float32,
+    ranges: Float32, which: Any, lengths: Float32, lean: Float32, start: Real, period: Real, length: Float32, slant: Float32,
+    quarter: Real, nearest: Real, bad: Any, depth: Float32, rounds: Float32,
 ) -> None:  # fmt: skip
     """Fuse the ranges (F, N) with their wraps, within one period from ``start``, and turn them into depth (N,).
 
@@ -405,7 +408,7 @@ def dim(power: Float32, variance: Float32, limits: Float32, bit: int, flags: NDA
 
 @compiled
 def inconsistent(
-    spare: Float32, power: Float32, variance: Float32, saturated: Any, rare: float, noisier: float, gross: float, bit: int,
+    spare: Float32, power: Float32, variance: Float32, saturated: Any, rare: Real, noisier: Real, gross: Real, bit: int,
     flags: NDArray[np.uint8],
 ) -> None:  # fmt: skip
     """Flag pixels (N,) in which the sum of squares of ``spare`` (R, N) is beyond noise; limits are chi squared, and a share of power."""
