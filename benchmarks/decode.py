@@ -1,9 +1,11 @@
 """How fast raw frames become depth, confidence and flags, and how often each way to unwrap fails in the dark.
 
-    python benchmarks/decode.py [--seconds 4]
+    python benchmarks/decode.py [--seconds 4] [--frames 4] [--points shared/realdata/azure_kinect_phases]
 
 One core, CPU time: 8 x 180 x 240 uint16 with the range errors, lamp offset and temperature of a real sensor. Beside the decoder
-stands a plain numpy script (float32 where numpy keeps it, ``arctan2``, no flags), measured in turns in the same run. The second table counts wrong wraps on frames of a synthetic room.
+stands a plain numpy script (float32 where numpy keeps it, ``arctan2``, no flags), measured in turns in the same run. The second
+table counts wrong wraps of every camera of the simulator, against the likelihood of all vectors there are. The third breaks a
+tap. The last decodes real points, where their folder is.
 """
 
 from __future__ import annotations
@@ -11,23 +13,32 @@ from __future__ import annotations
 import argparse
 import os
 import time
+import tomllib
 from collections.abc import Callable
+from dataclasses import replace
+from importlib.resources import files
+from itertools import product
+from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
 from tofcapture.camera import Camera
-from tofcapture.frames import TofInfo
+from tofcapture.channels import unambiguous, wrap_table
+from tofcapture.devices.sim.config import read_constants
+from tofcapture.frames import TofFlag, TofInfo
 from tofcapture.ops.phase import (
     Decoder,
+    TapNoise,
     ambiguity,
     frequencies,
+    information,
+    phasors,
     radial_to_range,
     radius_px,
     taps,
-    unwrap,
-    unwrap_spatial,
+    wrapped_range,
 )
 from tofcapture.rig import RangeError
 
@@ -40,6 +51,12 @@ ERRORS = (
 INFO = TofInfo("benchmark", "0", CAMERA, LIGHT, range_errors=ERRORS)
 LOW, HIGH = (ambiguity(f) for f in frequencies(INFO.modulation_hz))
 CELSIUS = 48.5
+SIGMAS = (2.0, 5.0, 20.0)  # amplitudes in standard deviations of a tap
+FAR = 15.0  # m
+# The author's fit of a real Azure Kinect: frequencies, and offset and slope of their phases along a row, in turns.
+KINECT_HZ = tuple(299_792_458 / 2 / R for R in (2.7980018, 0.7824560, 0.7618528))
+KINECT_OFFSETS = (-0.4306281, 0.5063031, 0.5523268)
+KINECT_SLOPES = (-0.0006160847, -0.0021119791, -0.0022633219)
 
 
 def room() -> np.ndarray:
@@ -101,25 +118,143 @@ def rates(ways: dict[str, Callable[[], object]], seconds: float) -> dict[str, tu
     return {name: (1 / float(np.quantile(t, 0.05)), 1 / float(np.median(t))) for name, t in times.items()}
 
 
-def wrong_wraps(amplitude: float, rng: np.random.Generator, frames: int = 4) -> list[float]:
-    """Share of pixels in a wrong wrap: rounding, with neighbours, at so many tap sigmas."""
-    truth = radial_to_range(room(), CAMERA, LIGHT)
-    counts = np.zeros(2)
-    for _ in range(frames):
-        z = np.stack(
-            [a * amplitude * np.exp(2j * np.pi * truth / R) for a, R in ((0.85 / 0.6, LOW), (1.0, HIGH))]
+def cameras() -> dict[str, tuple[TofInfo, float]]:
+    """Every camera of cameras.toml, at the benchmark's size, and how far it is asked to look: 15 m, or what its set can tell."""
+    out = {}
+    names = tomllib.loads((files("tofcapture.devices.sim") / "cameras.toml").read_text(encoding="utf-8"))
+    for name in names:
+        sensor = read_constants({"tof": {"preset": name}}, name).sensor
+        hz = frequencies(sensor.modulation_hz)
+        far = min(unambiguous(hz), FAR)
+        errors = tuple(replace(e, table="") for e in sensor.range_errors)
+        channels = sensor.modulation_hz, sensor.phase_rad
+        out[name] = (
+            TofInfo(
+                name, "", CAMERA, np.zeros(3), *channels, saturation=1e6, range_errors=() if name == "paper" else errors,
+                offset=sensor.offset, reach=(0.0, far) if far < unambiguous(hz) else None,
+            ),
+            far,
+        )  # fmt: skip
+    return out
+
+
+def surfaces(far: float, rng: np.random.Generator) -> np.ndarray:
+    """(H, W) ranges of a floor, a wall and boxes that fill what a camera can tell apart, placed at random."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    out = far * (0.95 - 0.25 * v / CAMERA.height - 0.05 * u / CAMERA.width)
+    for _ in range(12):
+        top, left = rng.integers(0, CAMERA.height - 40), rng.integers(0, CAMERA.width - 50)
+        box = (v >= top) & (v < top + rng.integers(25, 60)) & (u >= left) & (u < left + rng.integers(25, 70))
+        out = np.where(box, rng.uniform(0.05, 0.95) * far + 2e-4 * far * (u - left), out)
+    return out
+
+
+def exposed(
+    info: TofInfo, range_: np.ndarray, amplitude: float, rng: np.random.Generator, clock: float = 0.0
+) -> np.ndarray:
+    """(K, H, W) taps at so many standard deviations of a tap, of a camera whose frequencies run fast by the share ``clock``."""
+    z = [
+        amplitude * np.exp(2j * np.pi * range_ * (1 + clock) / ambiguity(f))
+        for f in frequencies(info.modulation_hz)
+    ]
+    mean = np.full((len(z), *range_.shape), 2.0 * amplitude * info.offset)
+    clean = taps(np.stack(z), mean, info.modulation_hz, info.phase_rad)
+    return clean + rng.standard_normal(clean.shape)
+
+
+def exact(info: TofInfo, raw: np.ndarray, far: float) -> np.ndarray:
+    """(H, W) ranges by the likelihood of every vector of wraps there is, float64, one product after the other."""
+    z = phasors(raw, info.modulation_hz, info.phase_rad, offset=info.offset)
+    hz = frequencies(info.modulation_hz)
+    U = np.array([ambiguity(f) for f in hz])
+    r = np.stack([wrapped_range(p, f) for p, f in zip(z, hz, strict=True)])
+    weight = (information(info) / U**2)[:, None, None] * np.abs(z) ** 2
+    table = wrap_table(hz, information(info), info.reach)
+    best, chosen = np.full(raw.shape[1:], np.inf), np.zeros(raw.shape[1:])
+    every = [range(-1, int(np.ceil(far / u)) + 1) for u in U]
+    for n in product(*every):
+        if np.ptp(np.array(n) * U) > 2 * U.max():
+            continue  # no noise makes ranges that far apart one
+        full = r + (np.array(n) * U)[:, None, None]
+        mean = (weight * full).sum(0) / weight.sum(0)
+        cost = (weight * (full - mean) ** 2).sum(0)
+        fused = np.tensordot(table.lean, full, 1)
+        better = (cost < best - 1e-9) & (mean > -U[-1] / 4) & (mean < far + U[-1] / 4)
+        best, chosen = np.where(better, cost, best), np.where(better, fused, chosen)
+    return chosen - table.period * np.floor((chosen - table.start) / table.period)
+
+
+def unwrapping(rng: np.random.Generator, frames: int) -> None:
+    """Print how often each camera takes another wrap than the true one."""
+    print(
+        f"\nwrong wraps, % of pixels (decoder with neighbours / exact likelihood of each pixel alone), {frames} frames"
+    )
+    print(f"{'camera':20} {'MHz':>20} {'m':>6} {'vectors':>7} " + "".join(f"{f'{a:g} sigma':>16}" for a in SIGMAS)
+          + f"{'same choice':>13}{'clock 0.5 %':>13}{'0.1 % off':>11}{'frames/s':>9}")  # fmt: skip
+    for name, (info, far) in cameras().items():
+        hz = frequencies(info.modulation_hz)
+        decoder = Decoder(info, TapNoise(np.inf, 1.0))
+        cells, same = [], []
+        for amplitude in SIGMAS:
+            counts = np.zeros(2)
+            for _ in range(frames):
+                range_ = surfaces(far, rng)
+                raw = exposed(info, range_, amplitude, rng)
+                alone, found = exact(info, raw, far), CAMERA.depth_to_radial(decoder(raw).depth)
+                counts += [off(way, range_, decoder) for way in (found, alone)]
+                if amplitude == SIGMAS[-1]:
+                    same.append(1 - off(found, alone, decoder))
+            cells.append(" / ".join(f"{100 * c / frames:.3f}" for c in counts))
+        shares = []
+        for told, clock in ((1.005, 0.005), (1.0, 0.001)):
+            there = replace(info, modulation_hz=tuple(told * f for f in info.modulation_hz), reach=None)
+            range_ = surfaces(far / 1.01, rng)
+            one = Decoder(there, TapNoise(np.inf, 1.0))
+            found = CAMERA.depth_to_radial(one(exposed(info, range_, SIGMAS[-1], rng, clock)).depth)
+            shares.append(100 * off(found, range_ * (1 + clock) / told, one))
+        speed = rates({"": lambda raw=raw, decoder=decoder: decoder(raw)}, 0.4)[""][0]
+        print(f"{name:20} {'/'.join(f'{f / 1e6:g}' for f in hz):>20} {far:6.2f} {len(decoder.wraps.wraps):7d} "
+              + "".join(f"{c:>16}" for c in cells) + f"{100 * np.mean(same):12.4f}%{shares[0]:13.3f}{shares[1]:11.3f}{speed:9.0f}")  # fmt: skip
+
+
+def off(found: np.ndarray, truth: np.ndarray, decoder: Decoder) -> float:
+    """Share of the pixels whose range is another wrap's: beyond half of the highest frequency's, not counting whole periods."""
+    period, U = decoder.wraps.period, ambiguity(max(decoder.info.modulation_hz))
+    apart = np.abs((found - truth + period / 2) % period - period / 2)
+    return float((~(apart < min(U, period) / 2 - 1e-6)).mean())
+
+
+def stuck(rng: np.random.Generator) -> None:
+    """Print how many pixels of twenty rows with a stuck tap are flagged, and of sound ones."""
+    print(f"\nstuck tap on 20 rows, % of pixels flagged\n{'stuck at':>22} {'rows':>8} {'elsewhere':>10}")
+    decoder, sound = Decoder(INFO), []
+    for value in (0, 60, 100, 250, 500, 1000, 4000, 4095):
+        raw = frame(rng)
+        raw[rng.integers(8), 80:100] = value
+        flags = decoder(raw, CELSIUS).flags & (TofFlag.INCONSISTENT | TofFlag.SATURATED)
+        print(
+            f"{value:22d} {100 * (flags[80:100] > 0).mean():8.2f} {100 * (np.delete(flags, np.s_[80:100], 0) > 0).mean():10.4f}"
         )
-        # A phasor of four taps has their noise over the root of two in each part.
-        z += (rng.standard_normal(z.shape) + 1j * rng.standard_normal(z.shape)) / np.sqrt(2)
-        low, high = (
-            np.mod(np.angle(p), 2 * np.pi) * R / (2 * np.pi) for p, R in zip(z, (LOW, HIGH), strict=True)
-        )
-        found = (
-            unwrap(low, high, HIGH, LOW),
-            unwrap_spatial(low, high, np.abs(z), HIGH, LOW, 1.0),
-        )
-        counts += [(np.abs(way - truth) > HIGH / 2).mean() for way in found]
-    return [float(c) for c in counts / frames]
+        sound.append(decoder(frame(rng), CELSIUS).flags & TofFlag.INCONSISTENT > 0)
+    print(f"{'sound frames':>22} {'':8} {100 * np.mean(sound):10.4f}")
+
+
+def kinect_points(folder: Path) -> None:
+    """Print what nine measured points of a real camera of three frequencies unwrap to."""
+    U = np.array([ambiguity(f) for f in KINECT_HZ])
+    rows = np.loadtxt(folder / "nfov.csv", delimiter=",", skiprows=1)
+    x, tape, phase = rows[:, 0], rows[:, 1], rows[:, 2:][:, ::-1]
+    offset, slope = np.array(KINECT_OFFSETS), np.array(KINECT_SLOPES)
+    wrapped = (phase / (2 * np.pi) + offset + slope * x[:, None]) % 1 * U
+    camera = Camera(9, 1, 1e9, 1e9, 4.0, 0.0)
+    info = TofInfo(
+        "", "", camera, np.zeros(3), tuple(f for f in KINECT_HZ for _ in range(3)), (0.0, 2.1, 4.2) * 3
+    )
+    z = 100 * np.exp(2j * np.pi * wrapped.T / U[:, None])[:, None]
+    raw = taps(z, np.full(z.shape, 300.0), info.modulation_hz, info.phase_rad)
+    found = Decoder(info)(raw).depth[0]
+    print(f"\nnine points of a real camera: {(np.abs(found - tape) < U.min() / 2).sum()} of {len(tape)} wraps, "
+          f"{1e3 * (found - tape).min():.0f} to {1e3 * (found - tape).max():.0f} mm")  # fmt: skip
 
 
 def main() -> None:
@@ -127,6 +262,13 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seconds", type=float, default=4.0, help="of CPU per way")
+    parser.add_argument("--frames", type=int, default=4, help="of each camera and amplitude")
+    parser.add_argument(
+        "--points",
+        type=Path,
+        default=Path("shared/realdata/azure_kinect_phases"),
+        help="folder of the nine real points",
+    )
     args = parser.parse_args()
     rng = np.random.default_rng(0)
     raw, decoder = frame(rng), Decoder(INFO)
@@ -149,10 +291,10 @@ def main() -> None:
     for name, depth in (("decoder", found.depth), ("plain script", plain)):
         error = 1e3 * np.abs(depth - truth)
         print(f"{name} - scene: median {np.nanmedian(error):.2f} mm (noise of one frame included)")
-    print(f"\nwrong wraps, %\n{'amplitude / tap sigma':>22} {'rounding':>9} {'neighbours':>11}")
-    for amplitude in (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0):
-        row = [100 * share for share in wrong_wraps(amplitude, rng)]
-        print(f"{amplitude:22.1f} {row[0]:9.3f} {row[1]:11.3f}")
+    unwrapping(rng, args.frames)
+    stuck(rng)
+    if args.points.is_dir():
+        kinect_points(args.points)
 
 
 if __name__ == "__main__":

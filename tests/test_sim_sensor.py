@@ -7,7 +7,7 @@ import pytest
 
 from tofcapture.camera import Camera
 from tofcapture.devices.sim.light import Light
-from tofcapture.devices.sim.sensor import Sensor, check_channels, expose, ideal, scatter
+from tofcapture.devices.sim.sensor import Sensor, check_sensor, expose, ideal, scatter
 from tofcapture.errors import ConfigError
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoder, mean_phasors, phasors, wrapped_range
@@ -41,7 +41,7 @@ def test_ideal_is_exact():
     for r in ranges(raw):
         np.testing.assert_allclose(r, 1.234, atol=1e-9)
     z = phasors(raw[0], INFO.modulation_hz, INFO.phase_rad)
-    np.testing.assert_allclose(np.abs(z[1]), 0.5 * CLEAN.signal * CLEAN.contrast[1])
+    np.testing.assert_allclose(np.abs(z[1]), 0.5 * CLEAN.signal[0] * CLEAN.contrast[1])
 
 
 def test_exposure_scales_the_signal():
@@ -181,7 +181,7 @@ def test_other_channels_decode_to_the_range():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"phase_rad": (0.0,) * 7}, "8 phase_rad"),
+        ({"phase_rad": (0.0,) * 7}, "a phase for each of 8 channels"),
         ({"contrast": (0.5,)}, "contrast"),
         ({"phase_rad": (0.0,) * 8}, "do not determine a phasor"),
         ({"range_errors": (RangeError(15e6),)}, "which no channel has"),
@@ -190,4 +190,4 @@ def test_other_channels_decode_to_the_range():
 def test_channels_that_no_decoder_takes_are_refused(change, message):
     """Each with the key and what it should hold."""
     with pytest.raises(ConfigError, match=message):
-        check_channels(replace(Sensor(), **change), "world")
+        check_sensor(replace(Sensor(), **change), "world")

@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from tofcapture.camera import Camera
+from tofcapture.channels import parse_reach
 from tofcapture.devices.registry import check_keys
 from tofcapture.devices.sim import sensor as sensors
 from tofcapture.devices.sim import stereo as stereos
@@ -89,12 +90,12 @@ def read_constants(overrides: Mapping[str, Any], where: str) -> Constants:
 
     :class:`ConfigError` names a key that constants.toml does not know, or a value that cannot be.
     """
-    defaults = tomllib.loads(Path(__file__).with_name("constants.toml").read_text(encoding="utf-8"))
+    defaults = _with_preset(_shipped("constants.toml"), overrides, where)
 
     def table(name: str) -> dict[str, Any]:
         given = overrides.get(name, {})
-        check_keys(given, set(defaults[name]), f"{where}: [{name}]")
-        return {**defaults[name], **given}
+        check_keys(given, {*defaults[name], *(["preset"] if name == "tof" else [])}, f"{where}: [{name}]")
+        return {**defaults[name], **{k: v for k, v in given.items() if k != "preset"}}
 
     def made(kind: Callable[..., _T], name: str, values: Mapping[str, Any]) -> _T:
         try:
@@ -107,22 +108,58 @@ def read_constants(overrides: Mapping[str, Any], where: str) -> Constants:
     if illuminator.shape != (3,):
         raise ConfigError(f"{where}: [tof] illuminator: expected 3 numbers, got {illuminator.tolist()}")
     sensor["range_errors"] = tuple(range_error_from(e) for e in sensor.pop("range_error"))
-    for key in ("modulation_hz", "phase_rad", "contrast"):
-        sensor[key] = tuple(float(x) for x in sensor[key])
+    for key in ("modulation_hz", "phase_rad", "contrast", "signal"):
+        sensor[key] = tuple(float(x) for x in np.atleast_1d(sensor[key]))
+    sensor["reach"] = parse_reach(tof.pop("reach") or None, f"{where}: [tof]")
     sensor["harmonics"] = tuple((int(m), float(a)) for m, a in sensor["harmonics"])
     electronics = made(Sensor, "sensor", sensor)
-    sensors.check_channels(electronics, f"{where}: [sensor]")
+    sensors.check_sensor(electronics, f"{where}: [sensor]")
+    camera = made(Camera, "tof", tof)
     return Constants(
-        tof=made(Camera, "tof", tof),
+        tof=camera,
         illuminator=illuminator,
         lamp=table("lamp"),
-        sensor=electronics,
+        sensor=sensors.with_phase_table(electronics, camera),
         factory=table("factory"),
         stereo=made(Camera, "stereo", table("stereo")),
         stereo_model=made(StereoModel, "stereo_model", table("stereo_model")),
         rig=table("rig"),
         render=made(Render, "render", table("render")),
     )
+
+
+def _shipped(name: str) -> dict[str, Any]:
+    return tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
+
+
+def _with_preset(defaults: dict[str, Any], overrides: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Lay the camera of cameras.toml that ``[tof] preset`` names over the defaults; :class:`ConfigError` when there is none."""
+    name = overrides.get("tof", {}).get("preset", "paper")
+    known = _shipped("cameras.toml")
+    if name not in known:
+        raise ConfigError(
+            f"{where}: [tof] preset: no camera {name!r}", hint=f"cameras: {', '.join(sorted(known))}"
+        )
+    said = known[name]
+    tof, sensor = dict(defaults["tof"]), dict(defaults["sensor"])
+    if "size" in said:
+        width, height = said["size"]
+        focal = width / 2 / np.tan(np.radians(said["across"]) / 2)
+        tof |= {
+            "width": width,
+            "height": height,
+            "fx": focal,
+            "fy": focal,
+            "cx": (width - 1) / 2,
+            "cy": (height - 1) / 2,
+        }
+    if "mhz" in said:
+        each = list(zip(said["mhz"], said["phases"], strict=True))
+        sensor["modulation_hz"] = [round(mhz * 1e6) for mhz, phases in each for _ in phases]
+        sensor["phase_rad"] = [float(np.radians(p)) for _, phases in each for p in phases]
+        sensor |= {"contrast": np.resize(sensor["contrast"], len(each)).tolist(), "range_error": []}
+    sensor |= {k: said[k] for k in ("contrast", "offset", "full_scale", "phase_table") if k in said}
+    return {**defaults, "tof": tof, "sensor": sensor}
 
 
 def load_world(path: Path) -> WorldFile:

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.channels import SPEED_OF_LIGHT, solution
+from tofcapture.camera import Camera
+from tofcapture.channels import SPEED_OF_LIGHT, Reach, check_channels, frequencies
 from tofcapture.devices.sim.light import Light
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
-from tofcapture.ops.phase import Complex128, frequencies
+from tofcapture.ops.phase import Complex128
 from tofcapture.poses import Float64
-from tofcapture.rig import RangeError, image_places, radius_px
+from tofcapture.rig import RangeError, image_places, packed_table, radius_px
 
 _FEW = 200.0  # electrons; below, shot noise is drawn from the Poisson distribution itself
 
@@ -29,7 +30,13 @@ class Sensor:
 
     modulation_hz: tuple[float, ...] = PAPER_MODULATION_HZ  #: (K,) of each raw channel.
     phase_rad: tuple[float, ...] = PAPER_PHASE_RAD  #: (K,) demodulation phase of each raw channel.
-    signal: float = 280.0  #: Raw units that white, facing, at 1 m adds to a tap in the nominal exposure.
+    #: Raw units that white, facing, at 1 m adds to a tap in the nominal exposure; one, or (F,) ascending.
+    signal: tuple[float, ...] = (280.0,)
+    offset: bool = True  #: Taps have one; without, they are differences of two wells, signed.
+    reach: Reach | None = None  #: Ranges that the camera is to decode, metres.
+    phase_table: float = (
+        0.0  #: Radians; size of the phase offset of each pixel and frequency that the maker knows.
+    )
     contrast: tuple[float, ...] = (0.85, 0.6)  #: (F,) A / B of each frequency, ascending.
     exposure: float = 400e-6  #: Seconds; the signal scales with its ratio to the nominal one.
     nominal_exposure: float = 400e-6
@@ -49,22 +56,22 @@ class Sensor:
     shot_noise: bool = True  #: Draw Poisson numbers of electrons.
 
 
-def check_channels(sensor: Sensor, where: str) -> None:
+def check_sensor(sensor: Sensor, where: str) -> None:
     """Refuse channels that no decoder could take, and range errors of frequencies that the sensor does not have.
 
     :class:`ConfigError` names the key and what it should hold.
     """
-    hz, K = frequencies(sensor.modulation_hz), len(sensor.modulation_hz)
-    if len(sensor.phase_rad) != K or len(sensor.contrast) != len(hz):
-        raise ConfigError(
-            f"{where}: expected {K} phase_rad as modulation_hz has channels, and a contrast for each of {len(hz)} frequencies, "
-            f"got {len(sensor.phase_rad)} and {len(sensor.contrast)}"
-        )
+    hz, phases = sensor.modulation_hz, sensor.phase_rad
     try:
-        for f in hz:
-            solution(sensor.modulation_hz, sensor.phase_rad, f)
+        check_channels(hz, phases, offset=sensor.offset, reach=sensor.reach, where=where)
     except DataError as err:
-        raise ConfigError(f"{where}: {err}", hint="three phases or more, spread over the turn") from err
+        raise ConfigError(err.message, err.hint) from err
+    F = len(frequencies(hz))
+    if len(sensor.contrast) != F or len(sensor.signal) not in (1, F):
+        raise ConfigError(
+            f"{where}: expected a contrast, and one signal or as many, for each of {F} frequencies, "
+            f"got {len(sensor.contrast)} and {len(sensor.signal)}"
+        )
     foreign = [e.modulation_hz for e in sensor.range_errors if e.modulation_hz not in hz]
     if foreign:
         raise ConfigError(
@@ -73,12 +80,28 @@ def check_channels(sensor: Sensor, where: str) -> None:
         )
 
 
+def with_phase_table(sensor: Sensor, camera: Camera) -> Sensor:
+    """Give every frequency a phase offset of each pixel, smooth, of the size that ``phase_table`` says."""
+    if not sensor.phase_table:
+        return sensor
+    x, y = np.moveaxis(image_places(camera), -1, 0)
+    known = {e.modulation_hz: e for e in sensor.range_errors}
+    errors = []
+    for k, hz in enumerate(frequencies(sensor.modulation_hz)):
+        turned = 0.6 * np.cos(2 * x + k) + 0.4 * np.sin(3 * y + 2 * k)
+        metres = sensor.phase_table * turned * SPEED_OF_LIGHT / (4 * np.pi * hz)
+        errors.append(replace(known.get(hz, RangeError(hz)), table=packed_table(metres)))
+    return replace(sensor, range_errors=tuple(errors))
+
+
 def ideal(sensor: Sensor) -> Sensor:
     """Return the same sensor with every imperfection off; taps are exact and float64."""
     off: dict[str, Any] = dict.fromkeys(
         ("ambient", "read_noise", "pixel_offset", "scattering", "celsius_drift"), 0.0
     )
-    return replace(sensor, **off, range_errors=(), harmonics=(), quantise=False, shot_noise=False)
+    return replace(
+        sensor, **off, range_errors=(), phase_table=0.0, harmonics=(), quantise=False, shot_noise=False
+    )
 
 
 @lru_cache(maxsize=4)
@@ -119,30 +142,39 @@ def expose(
     """Take a static burst.
 
     ``light`` is what reaches the pixels, ``info`` has channels and intrinsics, ``rng`` draws the noise of this burst. ``serial``
-    seeds what is fixed in this one camera: the offset of each pixel. Returns raw (frames, K, H, W), uint16, or float64 when
+    seeds what is fixed in this one camera: the offset of each pixel. Returns raw (frames, K, H, W), uint16, int16 of taps without an offset, or float64 when
     the sensor does not quantise, and the temperatures (frames,).
     """
     celsius = sensor.celsius + sensor.celsius_drift * rng.standard_normal(frames)
-    gain = sensor.signal * sensor.exposure / sensor.nominal_exposure
+    F = len(light.phasor)
+    gain = (np.resize(sensor.signal, F) * sensor.exposure / sensor.nominal_exposure)[:, None, None]
     phasor = scatter(light.phasor, sensor.scattering, sensor.scattering_radius) * gain
     steady = scatter(light.steady, sensor.scattering, sensor.scattering_radius) * gain
     phasor = phasor * np.asarray(sensor.contrast)[:, None, None]
     fixed = np.random.default_rng([serial, 1]).standard_normal(info.camera.shape) * sensor.pixel_offset
-    taps: NDArray[Any] = _taps(phasor, steady + sensor.ambient, sensor, info, fixed, celsius)
-    if sensor.shot_noise or sensor.read_noise:
+    mean = steady + sensor.ambient
+    taps: NDArray[Any] = _taps(phasor, mean, sensor, info, fixed, celsius)
+    if sensor.offset:
         taps = _noisy(taps, sensor, rng)
-    if sensor.quantise:
-        return np.clip(np.rint(taps), 0, sensor.full_scale).astype(np.uint16), celsius
-    return taps.astype(np.float64, copy=False), celsius
+    else:
+        hz = frequencies(info.modulation_hz)
+        other = 2 * mean[[hz.index(f) for f in info.modulation_hz]] - taps
+        taps = _noisy(taps, sensor, rng) - _noisy(other, sensor, rng)
+    if not sensor.quantise:
+        return taps.astype(np.float64, copy=False), celsius
+    least, kind = (0, np.uint16) if sensor.offset else (-sensor.full_scale, np.int16)
+    return np.clip(np.rint(taps), least, sensor.full_scale).astype(kind), celsius
 
 
-def _noisy(taps: Float64, sensor: Sensor, rng: np.random.Generator) -> NDArray[np.float32]:
+def _noisy(taps: Float64, sensor: Sensor, rng: np.random.Generator) -> NDArray[Any]:
     """Add shot and read noise to taps, from one draw of normal numbers.
 
     The sum of a Poisson number of mean L and read noise of variance s^2 has mean L, variance V = L + s^2 and third
     cumulant L. The normal number z is bent to have all three (Cornish and Fisher): ``L + sqrt(V) z + L / (6 V) (z^2 - 1)``.
     Where few electrons arrive, the Poisson number itself is drawn.
     """
+    if not (sensor.shot_noise or sensor.read_noise):
+        return taps
     mean = np.maximum(taps * sensor.electrons_per_unit, 0).astype(np.float32)
     shot = mean if sensor.shot_noise else np.zeros((), np.float32)
     z = rng.standard_normal(mean.shape, dtype=np.float32)
@@ -159,7 +191,7 @@ def _noisy(taps: Float64, sensor: Sensor, rng: np.random.Generator) -> NDArray[n
 def _taps(
     phasor: Complex128, mean: Float64, sensor: Sensor, info: TofInfo, fixed: Float64, celsius: Float64
 ) -> Float64:
-    """Compute noise-free taps (frames, K, H, W) of a burst.
+    """Compute noise-free taps (frames, K, H, W) of a burst, of one well, about the mean taps (F, H, W).
 
     Temperature turns all phases of a frequency by one angle a frame, so cosines are taken once a burst.
     """
@@ -167,7 +199,7 @@ def _taps(
     amplitude, phase = np.abs(phasor), np.mod(np.angle(phasor), 2 * np.pi)
     radius, place = radius_px(info.camera), image_places(info.camera)
     by_hz = {e.modulation_hz: e for e in sensor.range_errors}
-    out = np.empty((len(celsius), len(info.modulation_hz), *mean.shape))
+    out = np.empty((len(celsius), len(info.modulation_hz), *mean.shape[1:]))
     for i, f in enumerate(hz):
         error = by_hz.get(f, RangeError(f))
         turn = 4 * np.pi * f / SPEED_OF_LIGHT
@@ -176,7 +208,7 @@ def _taps(
         warm = turn * error.per_kelvin * (celsius - error.reference_celsius)
         for k in np.flatnonzero(np.asarray(info.modulation_hz) == f):
             x = late + info.phase_rad[k]
-            out[:, k] = mean + amplitude[i] * _wave(x, warm, sensor.harmonics)
+            out[:, k] = mean[i] + amplitude[i] * _wave(x, warm, sensor.harmonics)
     return out
 
 

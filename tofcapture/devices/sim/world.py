@@ -167,6 +167,8 @@ class SimWorld:
             exposure=constants.sensor.exposure,
             saturation=constants.sensor.full_scale,
             range_errors=factory_calibration(constants, seed),
+            offset=constants.sensor.offset,
+            reach=constants.sensor.reach,
         )
         self.stereo_info = StereoInfo("simulated 1280x1024 stereo", f"sim-stereo-{seed}", constants.stereo)
 
