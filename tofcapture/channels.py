@@ -1,13 +1,12 @@
 """Channels of a ToF camera as data: what its frequencies and phases determine, before any image is seen.
 
 Channel k is ``C_k = B + A cos(phi + phase_k)`` of its frequency, or without ``B`` where taps carry no offset. A frequency f knows a
-range modulo ``U = c / 2f``. Ranges of several frequencies agree on a few vectors of wraps only, which :func:`wrap_table` lists.
+range modulo ``U = c / 2f``. Ranges of several frequencies agree on a few vectors of wraps only: :func:`wrap_table`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -149,20 +148,24 @@ def unambiguous(hz: Sequence[float]) -> float:
 
 
 class WrapTable(NamedTuple):
-    """Hold the consistent wrap vectors of a camera's F frequencies, ascending, within its reach."""
+    """Hold the wraps that F frequencies, ascending, may have within their reach.
 
-    wraps: NDArray[np.int64]  #: (J, F)
-    lengths: Float64  #: (J, F) metres that each wrap vector adds to the wrapped ranges
+    Once the wraps of the highest frequency are chosen, those of the others are the nearest ones: a vector of wraps is its number.
+    """
+
+    tops: Float64  #: (J,) metres that each number of wraps adds to the range of the highest frequency
+    U: Float64  #: (F,) ambiguities, metres
     lean: Float64  #: (F,) shares in the range: inverse variances at equal phase noise; their sum is 1
     period: float  #: metres after which ranges look the same
     start: float  #: metres; ranges are given from here over one period
+    bounds: Float64  #: (2,) metres, ranges of the highest frequency within the reach and its noise; infinite when all are
     apart: float  #: closest two vectors, as :data:`TOLD_APART` counts; infinite when there is one
 
 
 def wrap_table(
     hz: Sequence[float], information: Sequence[float] | Float64, reach: Reach | None = None
 ) -> WrapTable:
-    """List the wrap vectors of frequencies (F,) that ranges of the ``reach``, metres, and some noise may show.
+    """List the wraps of frequencies (F,) that ranges of the ``reach``, metres, may show, and noise at its ends.
 
     ``information`` (F,) is that of each phasor per power and tap variance: half the number of phases where they are evenly
     spread. Without a reach it is all that the frequencies tell apart.
@@ -170,26 +173,22 @@ def wrap_table(
     U = np.array([ambiguity(f) for f in hz])
     period = unambiguous(hz)
     low, high = reach or (0.0, period)
-    cells = []
-    for top in range(int(np.floor(low / U[-1] - _NOISE)), int(np.ceil(high / U[-1] + _NOISE))):
-        span = (np.array([top - _NOISE, top + 1 + _NOISE]) * U[-1]).clip(low, high)
-        others = [
-            range(int(np.floor(span[0] / u - _NOISE)), int(np.ceil(span[1] / u + _NOISE))) for u in U[:-1]
-        ]
-        cells += [(*n, top) for n in product(*others)]
-    n = np.array(cells, dtype=np.int64)
-    first, last = ((n - _NOISE) * U).max(axis=1), ((n + 1 + _NOISE) * U).min(axis=1)
-    overlap = np.minimum(last, high) - np.maximum(first, low)
-    n, overlap = n[overlap > 0], overlap[overlap > 0]
-    kept: list[int] = []
-    for j in np.argsort(-overlap, kind="stable"):
-        if not kept or _fitted((n[kept] - n[j]) * U, U)[1].min() >= TOLD_APART:
-            kept.append(int(j))
-    n = n[sorted(kept)]
-    gaps = [_fitted((n[:j] - n[j]) * U, U)[1].min() for j in range(1, len(n))]
+    first, last = np.floor(low / U[-1] - _NOISE), np.ceil(high / U[-1] + _NOISE)
+    most = round(period / U[-1])  # more look like the first ones
+    if last - first > most:
+        first = np.floor((low + high) / 2 / U[-1] - most / 2 + 0.5)
+        last = first + most
+    wraps = np.arange(first, last)
+    steps = np.arange(1, len(wraps))[:, None] * U[-1]
+    gaps = _fitted(np.rint(steps / U) * U, U)[1]
     weight = np.asarray(information) / np.square(U)
-    start = (low + high - period) / 2
-    return WrapTable(n, n * U, weight / weight.sum(), period, start, min(map(float, gaps), default=np.inf))
+    noise = _NOISE * U[-1]
+    whole = high - low > period - 2 * noise
+    bounds = np.array([-np.inf, np.inf]) if whole else np.array([max(low - noise, 0.0), high + noise])
+    apart = float(gaps.min(initial=np.inf))
+    return WrapTable(
+        wraps * U[-1], U, weight / weight.sum(), period, (low + high - period) / 2, bounds, apart
+    )
 
 
 def parse_reach(value: object, where: str) -> Reach | None:

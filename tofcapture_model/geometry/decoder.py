@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from tofcapture.camera import Camera
-from tofcapture.channels import ambiguity, frequencies, wrap_table
+from tofcapture.channels import frequencies, wrap_table
 from tofcapture.errors import DataError
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import TapNoise, information
@@ -80,10 +80,13 @@ class TorchDecoder:
         def there(array: NDArray[Any]) -> Tensor:
             return torch.tensor(array, dtype=torch.float32, device=device)
 
-        U = np.array([ambiguity(f) for f in hz])
         self._length, self._slant = there(camera.ray_lengths), there(camera.rays @ place / 2)
         self._rows = there(tap_rows(info).weights[: 2 * len(hz) + 1])
-        self._lengths, self._lean = there(self._wraps.lengths), there(self._wraps.lean)[:, None, None]
+        U, self._tops, self._lean = (
+            self._wraps.U,
+            there(self._wraps.tops),
+            there(self._wraps.lean)[:, None, None],
+        )
         self._unambiguous, self._weight = (
             there(x)[:, None, None] for x in (U, np.square(2 * np.pi / U) * known)
         )
@@ -118,7 +121,8 @@ class TorchDecoder:
         saturation = self._info.saturation
         sure = lit & (raw.amax(0) < saturation) & (raw.amin(0) > -saturation)
         which = self._unwrapped(ranges, amplitude, variance, sure)
-        unwrapped = ranges + self._lengths[which].movedim(-1, 0)
+        unwrapped = ranges[-1] + self._tops[which]
+        unwrapped = unwrapped + self._apart(ranges, unwrapped)
         fused = (self._lean * unwrapped).sum(0)
         start, period = self._wraps.start, self._wraps.period
         fused = fused - torch.floor((fused - start) / period) * period
@@ -147,10 +151,16 @@ class TorchDecoder:
         which, best, second = self._likeliest(ranges, amplitude.square())
         pooled, power = self._pooled(ranges, amplitude * good, good)
         found, _, _ = self._likeliest(pooled, power)
-        apart = ranges + self._lengths[found].movedim(-1, 0)
-        mine = self._misfit(apart - apart[-1], self._weight * amplitude.square())
+        mine = self._misfit(
+            self._apart(ranges, ranges[-1] + self._tops[found]), self._weight * amplitude.square()
+        )
         unsure = (second - best < SURE * variance) & good
         return torch.where(unsure & (mine - best <= UNLIKELY * variance), found, which)
+
+    def _apart(self, ranges: Tensor, highest: Tensor) -> Tensor:
+        """Compute how far ranges (F, H, W), with their nearest wraps, are from the unwrapped highest one (H, W)."""
+        x = ranges - highest
+        return x - torch.floor(x / self._unambiguous + 0.5) * self._unambiguous
 
     @staticmethod
     def _misfit(apart: Tensor, weight: Tensor) -> Tensor:
@@ -160,11 +170,14 @@ class TorchDecoder:
 
     def _likeliest(self, ranges: Tensor, power: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Find the best wrap vector (H, W), its misfit and the second one's."""
-        apart, weight = ranges - ranges[-1], self._weight * power
+        weight = self._weight * power
         best = second = torch.full_like(ranges[0], math.inf)
         which = torch.zeros_like(ranges[0], dtype=torch.int64)
-        for j, lengths in enumerate(self._lengths - self._lengths[:, -1:]):
-            misfit = self._misfit(apart + lengths[:, None, None], weight)
+        for j, top in enumerate(self._tops):
+            highest = ranges[-1] + top
+            misfit = self._misfit(self._apart(ranges, highest), weight)
+            least, most = self._wraps.bounds
+            misfit = torch.where((highest >= least) & (highest <= most), misfit, math.inf)
             second = torch.minimum(second, torch.maximum(misfit, best))
             which = torch.where(misfit < best, j, which)
             best = torch.minimum(misfit, best)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.channels import ambiguity, frequencies, wrap_table
+from tofcapture.channels import frequencies, wrap_table
 from tofcapture.errors import DataError
 from tofcapture.frames import TofFlag, TofInfo
 from tofcapture.ops.phase import float32
@@ -27,6 +27,7 @@ RADIUS = 2  # px of the window that is asked where a pixel alone cannot tell its
 UNCERTAIN = 0.020  # m, standard deviation from which a pixel is of low confidence
 _STEEP = float(np.tan(np.radians(80)))
 _SAMPLE = 41  # pixels apart, of those whose misfit tells the frame's own noise
+_BROKEN = 0.25  # of a row's or column's pixels inconsistent: all of it is
 _GROSS = np.float32(0.25**2)  # of the power: more is off in no sound tap, whatever the noise of the frame
 
 
@@ -78,12 +79,12 @@ class Decoder:
         self._rows, self._spare = float32.sparse(rows.weights), rows.spare
         by_hz = {e.modulation_hz: e for e in info.range_errors}
         self._corrections = [Correction(by_hz.get(f, RangeError(f)), info.camera) for f in hz]
-        self._U = np.array([ambiguity(f) for f in hz])
         known = information(info)
         self.wraps = wrap_table(hz, known, info.reach)
-        unit = np.square(2 * np.pi / self._U)
-        self._lengths, self._lean, self._weight, self._unit = (
-            np.asarray(x, np.float32) for x in (self.wraps.lengths, self.wraps.lean, unit * known, unit)
+        unit = np.square(2 * np.pi / self.wraps.U)
+        self._tops, self._lean, self._weight, self._unit, self._periods, self._bounds = (
+            np.asarray(x, np.float32)
+            for x in (self.wraps.tops, self.wraps.lean, unit * known, unit, self.wraps.U, self.wraps.bounds)
         )
         self._uncertain = (np.square(self.wraps.lean / UNCERTAIN) / (unit * known)).astype(np.float32)
         self._limit = np.float32(np.square(self.wraps.apart / 4))
@@ -107,9 +108,9 @@ class Decoder:
     def signals(self, raw: NDArray[Any], celsius: float = float("nan")) -> tuple[DepthMaps, Signals]:
         """Decode one frame (K, H, W), or the mean of some, and keep the phasors and the ranges of all frequencies."""
         maps = self(raw, celsius)
-        F, shape = len(self._U), self.info.camera.shape
+        F, shape = len(self._power), self.info.camera.shape
         phasor = self._taps[: 2 * F].reshape(2, F, *shape).swapaxes(0, 1)
-        ranges = self._ranges + self._lengths[self._which].T - self._rounds
+        ranges = self._ranges - self._rounds
         ranges[:, ~(self._power.min(axis=0) > 0)] = np.nan
         return maps, Signals(np.ascontiguousarray(phasor), ranges.reshape(F, *shape))
 
@@ -136,7 +137,7 @@ class Decoder:
     ) -> DepthMaps:
         celsius = celsius if np.isfinite(celsius) else UNKNOWN_CELSIUS
         float32.combine(np.ascontiguousarray(raw).reshape(len(raw), -1), *self._rows, self._taps)
-        F = len(self._U)
+        F = len(self._power)
         for k, correct in enumerate(self._corrections):
             correct(self._taps[k], self._taps[F + k], celsius, self._power[k], self._ranges[k])
         confidence = np.sqrt(self._power[-1])
@@ -148,7 +149,7 @@ class Decoder:
         self._unwrap(bad)
         depth = np.empty(len(bad), np.float32)
         float32.finish(
-            self._ranges, self._which, self._lengths, self._lean, np.float32(self.wraps.start), np.float32(self.wraps.period),
+            self._ranges, self._which, self._tops, self._periods, self._lean, np.float32(self.wraps.start), np.float32(self.wraps.period),
             self._length, self._slant, self._quarter, self._nearest, bad, depth, self._rounds,
         )  # fmt: skip
         shape = self.info.camera.shape
@@ -162,7 +163,7 @@ class Decoder:
     def _unwrap(self, bad: NDArray[np.bool_]) -> None:
         """Choose wraps: pixel by pixel, then with neighbours where a pixel alone cannot tell."""
         float32.choose(
-            self._ranges, self._power, self._variance, self._lengths, self._weight, self._unit, self._limit,
+            self._ranges, self._power, self._variance, self._tops, self._bounds, self._periods, self._weight, self._unit, self._limit,
             self._which, self._margin, self._doubt,
         )  # fmt: skip
         good = ~bad
@@ -172,8 +173,8 @@ class Decoder:
         shape = self.info.camera.shape
         images = self._ranges.reshape(-1, *shape), self._power.reshape(-1, *shape)
         float32.ask(
-            unsure, RADIUS, *images, self._variance.reshape(shape), good.reshape(shape), self._lengths, self._weight,
-            self._U.astype(np.float32), self._which.reshape(shape), self._doubt.reshape(shape),
+            unsure, RADIUS, *images, self._variance.reshape(shape), good.reshape(shape), self._tops, self._bounds, self._periods,
+            self._weight, self._which.reshape(shape), self._doubt.reshape(shape),
         )  # fmt: skip
 
     def _flags(self, saturated: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -189,7 +190,17 @@ class Decoder:
                     spare, power, self._variance, saturated, np.float32(_rare(count)), noisier, _GROSS,
                     int(TofFlag.INCONSISTENT), flags,
                 )  # fmt: skip
+        self._broken_lines(flags.reshape(self.info.camera.shape), saturated)
         return flags
+
+    def _broken_lines(self, flags: NDArray[np.uint8], saturated: NDArray[np.bool_]) -> None:
+        """Flag rows and columns of flags (H, W) whole where many pixels are inconsistent: some of a stuck tap's values are right by chance."""
+        bit = np.uint8(TofFlag.INCONSISTENT)
+        off, sound = (flags & bit) > 0, ~saturated.reshape(flags.shape)
+        if np.count_nonzero(off) > _BROKEN * min(flags.shape):
+            for axis in (0, 1):
+                lines = off.sum(axis=axis) > _BROKEN * np.maximum(sound.sum(axis=axis), 4)
+                flags |= bit * (sound & np.expand_dims(lines, axis))
 
     def _noisier(self, spare: Float32, power: Float32, saturated: NDArray[np.bool_]) -> float:
         """Tell how many times the variance that the noise model says this frame has, by the median of what no cosine explains."""

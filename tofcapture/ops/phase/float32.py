@@ -187,10 +187,10 @@ def _ranges(
 
 @compiled
 def choose(
-    ranges: Float32, power: Float32, variance: Float32, lengths: Float32, weight: Float32, unit: Float32, limit: Real,
+    ranges: Float32, power: Float32, variance: Float32, tops: Float32, bounds: Float32, U: Float32, weight: Float32, unit: Float32, limit: Real,
     which: NDArray[np.int32], margin: Float32, doubt: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Choose the wrap vector of each pixel by maximum likelihood.
+    """Choose the wraps of each pixel by maximum likelihood.
 
     Parameters
     ----------
@@ -198,14 +198,14 @@ def choose(
         (F, N) wrapped ranges, metres, and power of the phasors.
     variance
         (N,) of a tap.
-    lengths
-        (J, F) of the wrap vectors, metres.
+    tops, bounds, U
+        (J,) metres that wraps add to the highest frequency, (2,) least and largest sum, and ambiguities (F,).
     weight, unit
         (F,) inverse variance of a range per power and tap variance; and of equal phase noise of 1 rad.
     limit
-        Misfit at equal phase noise, radians squared, from which a vector is doubted.
+        Misfit at equal phase noise, radians squared, from which wraps are doubted.
     which, margin, doubt
-        (N,) vector; chi squared from it to the next; whether it is to be flagged.
+        (N,) index of ``tops``; chi squared from it to the next; whether it is to be flagged.
     """
     F, n = ranges.shape
     top = F - 1
@@ -231,19 +231,21 @@ def choose(
                 ek[i] = ranges_k[i] - highest[i]
         for i in range(m):
             inverse[i] = _ONE / (inverse[i] + _TINY)
-        for j in range(len(lengths)):
+        for j in range(len(tops)):
             cost[:] = np.float32(0)
             if top == 1:  # no sum of what cancels: the one difference between the two
-                w0, e0, apart = w[0], e[0], lengths[j, 0] - lengths[j, 1]
+                w0, e0, period, inverse_period = w[0], e[0], U[0], _ONE / U[0]
                 for i in range(m):
-                    x = e0[i] + apart
+                    x = e0[i] - tops[j]
+                    x -= period * np.floor(x * inverse_period + _HALF)
                     cost[i] = x * x * w0[i]
             else:
                 linear[:] = np.float32(0)
                 for k in range(top):
-                    wk, ek, apart = w[k], e[k], lengths[j, k] - lengths[j, top]
+                    wk, ek, period, inverse_period = w[k], e[k], U[k], _ONE / U[k]
                     for i in range(m):
-                        x = ek[i] + apart
+                        x = ek[i] - tops[j]
+                        x -= period * np.floor(x * inverse_period + _HALF)
                         y = wk[i] * x
                         cost[i] += y * x
                         linear[i] += y
@@ -251,6 +253,8 @@ def choose(
                     cost[i] -= linear[i] * linear[i] * inverse[i]
             number = np.int32(j)
             for i in range(m):
+                far = highest[i] + tops[j]
+                cost[i] = cost[i] if (far >= bounds[0]) & (far <= bounds[1]) else np.float32(np.inf)
                 larger = max(best[i], cost[i])
                 second[i] = min(second[i], larger)
                 chosen[i] = number if cost[i] < best[i] else chosen[i]
@@ -270,7 +274,8 @@ def choose(
             for k in range(top):
                 ek = e[k]
                 for i in range(m):
-                    x = ek[i] + (lengths[chosen[i], k] - lengths[chosen[i], top])
+                    x = ek[i] - tops[chosen[i]]
+                    x -= U[k] * np.floor(x / U[k] + _HALF)
                     cost[i] += unit[k] * x * x
                     linear[i] += unit[k] * x
             for i in range(m):
@@ -285,17 +290,17 @@ def choose(
 @compiled
 def ask(
     unsure: NDArray[np.int64], radius: int, ranges: Float32, power: Float32, variance: Float32, good: NDArray[np.bool_],
-    lengths: Float32, weight: Float32, U: Float32, which: Any, doubt: Any,
+    tops: Float32, bounds: Float32, U: Float32, weight: Float32, which: Any, doubt: Any,
 ) -> None:  # fmt: skip
     """Choose the wrap vector of some pixels with their neighbours' support.
 
     The window's phasors, turned by how much farther than the pixel the highest frequency says each neighbour is, are added up,
     weighted by ``cos^4`` of half that difference: other surfaces have no say. What the pixel itself rules out is not taken.
 
-    ``unsure`` are flat indices; images are (F, H, W) and (H, W), ``U`` (F,) ambiguities; others as for :func:`choose`.
+    ``unsure`` are flat indices; images are (F, H, W) and (H, W); others as for :func:`choose`.
     """
     F, H, W = ranges.shape
-    top, J = F - 1, len(lengths)
+    top, J = F - 1, len(tops)
     real, imag = np.empty(F, np.float32), np.empty(F, np.float32)
     e, own, w, p = (
         np.empty(F, np.float32),
@@ -348,14 +353,17 @@ def ask(
                 np.float32(0),
             )
             for k in range(top):
-                apart = lengths[j, k] - lengths[j, top]
-                a, b = e[k] + apart, own[k] + apart
+                a, b = e[k] - tops[j], own[k] - tops[j]
+                a -= U[k] * np.floor(a / U[k] + _HALF)
+                b -= U[k] * np.floor(b / U[k] + _HALF)
                 square += w[k] * a * a
                 linear += w[k] * a
                 own_square += p[k] * b * b
                 own_linear += p[k] * b
             cost = square - linear * linear / (total + _TINY)
             own_cost = own_square - own_linear * own_linear / (own_total + _TINY)
+            if here + tops[j] < bounds[0] or here + tops[j] > bounds[1]:
+                continue
             least = min(least, own_cost)
             if cost < best:
                 best, second, found, mine = cost, best, j, own_cost
@@ -370,22 +378,26 @@ def ask(
 
 @compiled
 def finish(
-    ranges: Float32, which: Any, lengths: Float32, lean: Float32, start: Real, period: Real, length: Float32, slant: Float32,
+    ranges: Float32, which: Any, tops: Float32, U: Float32, lean: Float32, start: Real, period: Real, length: Float32, slant: Float32,
     quarter: Real, nearest: Real, bad: Any, depth: Float32, rounds: Float32,
 ) -> None:  # fmt: skip
-    """Fuse the ranges (F, N) with their wraps, within one period from ``start``, and turn them into depth (N,).
+    """Unwrap the ranges (F, N), fuse them within one period from ``start``, and turn them into depth (N,).
 
     ``z = (D^2 - |s|^2 / 4) / (D L - r . s / 2)``, r the ray with z = 1, L its length, s the light source.
     """
     F, n = ranges.shape
     for begin in range(0, n, _BLOCK):
         end = min(begin + _BLOCK, n)
-        fused, chosen = depth[begin:end], which[begin:end]
-        fused[:] = np.float32(0)
-        for k in range(F):
-            own, share = ranges[k, begin:end], lean[k]
+        fused, chosen, highest = depth[begin:end], which[begin:end], ranges[F - 1, begin:end]
+        for i in range(len(fused)):
+            highest[i] += tops[chosen[i]]
+            fused[i] = lean[F - 1] * highest[i]
+        for k in range(F - 1):
+            own, share, period_k, inverse_period = ranges[k, begin:end], lean[k], U[k], _ONE / U[k]
             for i in range(len(fused)):
-                fused[i] += share * (own[i] + lengths[chosen[i], k])
+                x = own[i] - highest[i]
+                own[i] -= period_k * np.floor(x * inverse_period + _HALF)
+                fused[i] += share * own[i]
     for i in range(n):
         rounds[i] = period * np.floor((depth[i] - start) / period)
         D = depth[i] - rounds[i]

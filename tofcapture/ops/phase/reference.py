@@ -6,13 +6,14 @@ It asks no neighbours and raises no flags. Everything else that :class:`tofcaptu
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.channels import ambiguity, frequencies, wrap_table
+from tofcapture.channels import Reach, ambiguity, frequencies, wrap_table
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase.phasors import Complex128, Float64, information, phasors, wrapped_range
 from tofcapture.rig import RangeError, image_places, radius_px
@@ -54,19 +55,31 @@ def decode_phasors(phasor: Complex128, info: TofInfo, celsius: float = float("na
     )
     table = wrap_table(hz, known, info.reach)
     # Maximum likelihood: sum_k (r_k + n_k U_k - r)^2 / v_k over all vectors n, with r the mean of what is summed.
-    turn = 2 * np.pi / np.array([ambiguity(f) for f in hz])
+    turn = 2 * np.pi / table.U
     weight = (turn**2 * known)[:, None, None] * np.square(amplitude)
-    candidates = wrapped + table.lengths[:, :, None, None]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = (weight * candidates).sum(axis=1) / weight.sum(axis=0)
-    misfit = (weight * np.square(candidates - mean[:, None])).sum(axis=1)
-    best = misfit.argmin(axis=0)[None, None]
-    ranges = np.take_along_axis(candidates, best, axis=0)[0]
+    best, ranges = np.full(amplitude.shape[1:], np.inf), wrapped
+    for n in wrap_vectors(table.U, info.reach or (0.0, table.period)):
+        candidate = wrapped + (n * table.U)[:, None, None]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = (weight * candidate).sum(axis=0) / weight.sum(axis=0)
+        misfit = (weight * np.square(candidate - mean)).sum(axis=0)
+        better = (misfit < best) & (candidate[-1] >= table.bounds[0]) & (candidate[-1] <= table.bounds[1])
+        best, ranges = np.where(better, misfit, best), np.where(better, candidate, ranges)
     # Fused by inverse variance at equal phase noise, within one period.
     fused = np.tensordot(table.lean, ranges, axes=1)
     rounds = table.period * np.floor((fused - table.start) / table.period)
     radial = range_to_radial(fused - rounds, info.camera, info.illuminator)
-    return Decoded(np.where(amplitude.min(axis=0) > 0, radial, np.nan), ranges - rounds, amplitude, misfit)
+    return Decoded(np.where(amplitude.min(axis=0) > 0, radial, np.nan), ranges - rounds, amplitude, best)
+
+
+def wrap_vectors(U: Float64, reach: Reach) -> NDArray[np.int64]:
+    """List every vector of wraps (J, F) whose ranges, with half a wrap of noise, have one in common within the reach, metres."""
+    low, high = reach
+    every = [range(int(np.floor(low / u)) - 1, int(np.ceil(high / u)) + 1) for u in U]
+    n = np.array([v for v in product(*every) if np.ptp(np.array(v) * U) < 2 * U.max()], dtype=np.int64)
+    first, last = ((n - 0.5) * U).max(axis=1), ((n + 1.5) * U).min(axis=1)
+    out: NDArray[np.int64] = n[np.minimum(last, high) > np.maximum(first, low)]
+    return out
 
 
 def correct_range(
