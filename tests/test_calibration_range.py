@@ -156,6 +156,62 @@ def test_fitted_errors_correct_a_burst():
     )
 
 
+def test_a_short_range_leaves_the_waves_physical():
+    """Over half a metre waves, offset and scale look alike: none comes out larger than a sensor's, and beyond the range it stays near."""
+    rng = np.random.default_rng(0)
+    seen = [made(i, rng, away=0.8 + 0.5 * i / 11) for i in range(12)]
+    fit = fit_ranges(seen, T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
+    for error, true in zip(fit.errors, ERRORS, strict=True):
+        known = {m: np.hypot(a, b) for m, a, b in true.harmonics}
+        for m, a, b in error.harmonics:
+            assert abs(np.hypot(a, b) - known.get(m, 0.0)) < 0.007
+        assert error.fitted_m is not None
+        assert 0.5 < error.fitted_m[0] < 0.8
+        assert 1.3 < error.fitted_m[1] < 1.9
+    assert (left(fit.errors, ERRORS) < 2.5e-3).all(), left(fit.errors, ERRORS)
+
+
+def test_an_impossible_wave_is_held():
+    """Ranges that only a wave of 200 mm explains do not get one: 71 mrad of phase are the most that four taps make."""
+    wild = tuple(replace(e, harmonics=((1, 0.2, 0.0),)) for e in ERRORS[:1])
+    rng = np.random.default_rng(1)
+    fit = fit_ranges(
+        [made(i, rng, sensor=replace(SENSOR, range_errors=wild)) for i in range(VIEWS)], T_TOF_STEREO
+    )
+    for m, a, b in fit.errors[0].harmonics:
+        assert np.hypot(a, b) <= 0.0711 * 7.495 / (2 * np.pi), m
+
+
+def test_a_constant_between_the_frequencies_is_found():
+    """40 and 70 MHz whose ranges are 65 mm apart, as in captures of such a camera."""
+    info = replace(INFO, modulation_hz=(40e6,) * 4 + (70e6,) * 4)
+    errors = (RangeError(40e6, offset=0.065), RangeError(70e6, offset=0.0))
+    rng, seen = np.random.default_rng(4), []
+    k = 4 * np.pi / SPEED_OF_LIGHT * np.array([40e6, 70e6])[:, None, None]
+    for i in range(8):
+        view = made(2 * i, rng)
+        depth = plane_depth(CAMERA, np.eye(4), *plane_of(view))
+        range_ = phase.radial_to_range(CAMERA.depth_to_radial(depth), CAMERA, INFO.illuminator)
+        late = np.array([e.offset for e in errors])[:, None, None]
+        seen.append(replace(view, info=info, phasor=300 * np.exp(1j * k * (range_ + late))))
+    fit = fit_ranges(seen, T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
+    at = np.array(
+        [
+            [e.at(k[i, 0, 0] * r, 20.0, 45.0, np.zeros(2)) for r in (0.5, 0.9, 1.3)]
+            for i, e in enumerate(fit.errors)
+        ]
+    )
+    np.testing.assert_allclose(at[0], 0.065, atol=1.5e-3)
+    np.testing.assert_allclose(at[1], 0.0, atol=1.5e-3)
+
+
+def plane_of(seen):
+    """Normal and a point, ToF frame, of the plane that a view's stereo camera sees."""
+    points = poses.transform_points(T_TOF_STEREO, STEREO.unproject(seen.depth).reshape(-1, 3))
+    normal = np.linalg.lstsq(points, np.ones(len(points)), rcond=None)[0]
+    return normal / np.linalg.norm(normal), points.mean(axis=0)
+
+
 def test_too_few_views_and_a_wrong_frequency_are_refused():
     """Three views, and phases whose sign is reversed, have names."""
     rng = np.random.default_rng(3)
@@ -184,6 +240,8 @@ def test_command_writes_rig_and_report(recording):
     found = load_rig(recording / "rig.toml")
     assert (left(found.range_errors, ERRORS) < 2e-3).all()
     written = json.loads((recording / "range.json").read_text())
+    assert [list(e.fitted_m) for e in found.range_errors] == [written["covered_m"]] * 2
+    assert f"valid from {written['covered_m'][0]:.2f} to" in outcome.text
     assert written["transform"] == "nothing"
     assert written == dry.data == {k: v for k, v in outcome.data.items() if k != "rig"}
     answers.hold("range", {"data": written, "text": outcome.text}, off=0.03, least=1e-4)

@@ -43,6 +43,7 @@ class RangeError:
     per_inverse_amplitude: float = 0.0  #: Metres times raw units: what dark surfaces are measured too far.
     #: Metres that each pixel measures too long, (H, W), as :func:`packed_table` writes it; a camera's phase table (P0) is one.
     table: str = ""
+    fitted_m: tuple[float, float] | None = None  #: Ranges that it was fitted on; beyond them it is a guess.
 
     def at(
         self, phase: NDArray[np.floating], radius_px: NDArray[np.floating] | float, celsius: float,
@@ -197,7 +198,8 @@ def range_error_from(table: Mapping[str, Any]) -> RangeError:
     try:
         harmonics = tuple((int(m), float(a), float(b)) for m, a, b in values.pop("harmonics", []))
         image = tuple((int(i), int(j), float(c)) for i, j, c in values.pop("image", []))
-        return RangeError(harmonics=harmonics, image=image, **values)
+        fitted_m = parse_reach(values.pop("fitted_m", None), "range_error: fitted_m")
+        return RangeError(harmonics=harmonics, image=image, fitted_m=fitted_m, **values)
     except (TypeError, ValueError) as err:
         raise ConfigError(f"range_error: {err}", hint="see docs/formats.md, rig.toml") from err
 
@@ -209,6 +211,8 @@ def range_error_table(error: RangeError) -> dict[str, Any]:
     # Later terms are written where there are any: cameras without them keep the bytes of their files.
     if image := table.pop("image"):
         table["image"] = [list(c) for c in image]
+    if fitted := table.pop("fitted_m"):
+        table["fitted_m"] = list(fitted)
     for name in ("per_inverse_amplitude", "table"):
         if not table[name]:
             del table[name]

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.range_error.terms import IMAGE, ORDERS, Terms, jackknife, waves
+from calibration.range_error.terms import IMAGE, ORDERS, WAVES, Terms, jackknife, waves
 from calibration.range_error.views import RangeView, Seen, common_camera, range_view, wrapped
 from tofcapture.camera import Camera
 from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.errors import DataError, QualityError
 from tofcapture.frames import TofInfo
-from tofcapture.ops.phase import frequencies, radius_px
+from tofcapture.ops.phase import ambiguity, frequencies, radius_px
 from tofcapture.poses import Float64, exp, invert, transform, transform_points
 from tofcapture.rig import RangeError, image_places
 
@@ -35,7 +35,9 @@ TUKEY = 4.685
 MIN_KELVIN = 1.0  # K of spread between views below which temperature says nothing
 MIN_GREY = 0.35  # of ln A about its fall with range, below which amplitude and range are one
 # One sigma of what a maker's calibration may leave, or a camera without one may have. They only settle what the views do not.
-PRIOR_WAVE = 0.03  # rad; square waves and four taps make 0.071
+PRIOR_WAVE = 0.03  # rad over a whole period; of less, a wave, the offset and the scale look the same: so much less is believed
+MOST_WAVE = 0.071  # rad; what square waves and four taps make: no sensor has more
+TIGHTER = 20  # times at most that the waves beyond it are held tighter
 PRIOR_DARK = 0.003  # m at the median amplitude
 PRIOR = {
     "offset": 0.3,
@@ -95,15 +97,17 @@ def fit_ranges(
         views, refused = _compared(seen, T, centre)
         terms = _terms(info, views, orders)
         problem = _problem(info, views, terms, np.asarray(transform_sigma, dtype=np.float64), moved)
-        found = _solve(problem, rounds)
+        found = _physical(problem, terms, rounds)
         moved = moved + found.x[:6]
         T = W @ exp(found.x[:6]) @ invert(W) @ T
     parts = _parts(terms)
     sigma = np.sqrt(np.diag(found.covariance))
+    covered = _covered(views)
     return RangeFit(
         camera=info.camera,
         errors=tuple(
-            t.added(e, found.x[part]) for t, e, part in zip(terms, _makers(info), parts, strict=True)
+            replace(t.added(e, found.x[part]), fitted_m=covered)
+            for t, e, part in zip(terms, _makers(info), parts, strict=True)
         ),
         terms=terms,
         coefficients=tuple(found.x[part] for part in parts),
@@ -175,11 +179,43 @@ def _terms(info: TofInfo, views: Sequence[RangeView], orders: Sequence[int]) -> 
     )
 
 
-def _prior(terms: Terms, amplitude: float) -> Float64:
-    """One sigma of each coefficient; ``amplitude`` is the median, raw units."""
-    wave = PRIOR_WAVE * SPEED_OF_LIGHT / (4 * np.pi * terms.modulation_hz)
-    known = {**PRIOR, "cos": wave, "sin": wave, "darkness": PRIOR_DARK * amplitude}
-    return np.array([known[name.partition(" ")[0]] for name in terms.names])
+def _covered(views: Sequence[RangeView]) -> tuple[float, float]:
+    """Return the ranges that the views cover, metres, but for one pixel in a thousand at either end."""
+    near, far = np.quantile(np.concatenate([v.true for v in views]), [0.001, 0.999])
+    return float(near), float(far)
+
+
+def _prior(terms: Terms, amplitude: float, covered: tuple[float, float]) -> Float64:
+    """One sigma of each coefficient; ``amplitude`` is the median, raw units, the ranges ``covered`` are in metres."""
+    known = {**PRIOR, "darkness": PRIOR_DARK * amplitude}
+    turns = (covered[1] - covered[0]) / ambiguity(terms.modulation_hz)
+    out = []
+    for kind, _, index in (name.partition(" ") for name in terms.names):
+        seen = min(1.0, int(index) * turns) if kind in WAVES else 1.0
+        out.append(seen * PRIOR_WAVE * _radian(terms) if kind in WAVES else known[kind])
+    return np.array(out)
+
+
+def _radian(terms: Terms) -> float:
+    """Return the metres of range in a radian of phase."""
+    return ambiguity(terms.modulation_hz) / (2 * np.pi)
+
+
+def _physical(problem: _Problem, terms: Sequence[Terms], rounds: int) -> _Found:
+    """Solve, and hold the waves that come out larger than a sensor's can be tighter, until none is."""
+    for _ in range(TIGHTER):
+        found = _solve(problem, rounds)
+        tighter = np.ones_like(problem.prior)
+        for t, part in zip(terms, _parts(terms), strict=True):
+            x = found.x[part]
+            waves = [k for k, name in enumerate(t.names) if name.startswith("cos ")]
+            for k in waves:  # the sine stands behind its cosine
+                over = float(np.hypot(x[k], x[k + 1])) / (MOST_WAVE * _radian(t))
+                tighter[part][k : k + 2] = min(1.0, 0.9 / over) if over > 1 else 1.0
+        if (tighter == 1).all():
+            break
+        problem = replace(problem, prior=problem.prior * tighter)
+    return found
 
 
 def _parts(terms: Sequence[Terms]) -> list[slice]:
@@ -226,7 +262,8 @@ def _problem(
         own.append(np.c_[np.ones(len(view.true)), place])
         weight.append(1 / (np.square(view.sigma) + FLOOR**2))
     median = [float(np.median(np.concatenate([v.amplitude[i] for v in views]))) for i in range(len(terms))]
-    prior = np.concatenate([sigma, *map(_prior, terms, median)])
+    covered = _covered(views)
+    prior = np.concatenate([sigma, *(_prior(t, A, covered) for t, A in zip(terms, median, strict=True))])
     expected = np.r_[-moved, np.zeros(len(prior) - 6)]
     return _Problem(shared, own, _left_by_maker(info, views), weight, prior, expected)
 
