@@ -2,17 +2,24 @@
 
 import errno
 import os
+import shutil
 import sqlite3
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from tests.test_recorder import VIEWS, Bench, _arrays, _few_candidates, _record, rows
-from tofcapture.errors import BusyError, DataError, DeviceError
+from tofcapture.devices.contract import check_tof_info
+from tofcapture.devices.faults import ProtectiveStop
+from tofcapture.devices.kinematics import HOME
+from tofcapture.errors import BusyError, ConfigError, DataError, DeviceError
 from tofcapture.frames import ArmInfo
 from tofcapture.record import recorder, resources
 from tofcapture.record.journal import Journal, journal_path
 from tofcapture.record.observer import STEPS, Observer, Stopped
-from tofcapture.record.resources import DiskFull, hold_arm
+from tofcapture.record.recorder import record
+from tofcapture.record.resources import DiskFull, FolderGone, hold_arm
 
 __all__ = ["_few_candidates"]  # applies here too
 
@@ -177,3 +184,162 @@ def test_a_real_arm_has_one_master(tmp_path, monkeypatch):
     Real.simulated = True
     with hold_arm(Real()), hold_arm(Real()):
         pass
+
+
+def _moved(folder):
+    folder.rename(folder.with_name("elsewhere"))
+
+
+def _emptied(folder):
+    """As unmounting leaves it: the folder is there, another one, and empty."""
+    _moved(folder)
+    folder.mkdir()
+
+
+@pytest.mark.parametrize("go", [_moved, _emptied, shutil.rmtree], ids=["moved", "unmounted", "deleted"])
+@pytest.mark.parametrize("which", ["disk", "disk/r", "disk/r/views", "disk/r/views/mug"])
+@pytest.mark.parametrize("step", ["moving", "sealing"])
+def test_a_folder_that_goes_ends_the_run(tmp_path, go, which, step):
+    """Moved, unmounted or deleted while recording: the run ends with the reason, and nothing is written anywhere else."""
+
+    class Taking(Observer):
+        seen = 0
+
+        def sealed(self, view, sha256):
+            self.seen += 1
+
+        def step(self, index, name):
+            if self.seen == 1 and name == step:
+                go(tmp_path / which)
+
+    (tmp_path / "disk").mkdir()
+    out = tmp_path / "disk" / "r"
+    with pytest.raises(FolderGone, match="moved, deleted or unmounted") as told:
+        _record(out, observer=Taking())
+    assert which in told.value.message
+    assert not (tmp_path / which).exists() or not list((tmp_path / which).iterdir())
+    away = (tmp_path / which).with_name("elsewhere")
+    if away.exists():
+        assert len(list(away.rglob("view-*.h5"))) == 1
+        shutil.rmtree(tmp_path / which, ignore_errors=True)
+        away.rename(tmp_path / which)
+        assert len(_record(out).recorded) == VIEWS - 1
+
+
+def test_a_folder_that_goes_within_the_sealing(tmp_path, monkeypatch):
+    """Gone between the first and the last write of a view: the view does not count as sealed."""
+    real = recorder.write_view
+
+    def write(path, view):
+        if list(path.parent.glob("view-*.h5")):
+            _emptied(tmp_path / "r")
+            path.parent.mkdir(parents=True)
+        return real(path, view)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recorder, "write_view", write)
+        with pytest.raises(FolderGone):
+            _record(tmp_path / "r")
+    assert sorted(row.state for row in rows(tmp_path / "elsewhere")) == [*["planned"] * (VIEWS - 1), "sealed"]
+
+
+@pytest.mark.parametrize("fault", [ProtectiveStop("it hit something"), DeviceError("no answer")])
+def test_a_broken_device_at_the_last_view_is_no_fault_of_the_scene(tmp_path, fault):
+    """The last view has no other after it that would show the devices to work: the run ends in an error, and is gone on with."""
+    bench = Bench()
+
+    def fail(step):
+        if step == "tof" and bench.steps.count("tof") >= VIEWS:
+            raise fault
+
+    bench.before = fail
+    with pytest.raises(type(fault)):
+        _record(tmp_path, bench)
+    assert len(_record(tmp_path).recorded) == 1
+
+
+def test_a_view_that_fails_in_two_runs_is_given_up(tmp_path):
+    """A pose at which a camera fails in a station that was opened anew is that pose's own fault."""
+
+    def fail(step):
+        if step == "tof" and bench.steps.count("tof") >= first:
+            raise DeviceError("no answer")
+
+    bench, first = Bench(fail), VIEWS
+    with pytest.raises(DeviceError):
+        _record(tmp_path, bench)
+    bench, first = Bench(fail), 0
+    assert len(_record(tmp_path, bench).failed) == 1
+
+
+def _change(station, role, **change):
+    """A station one of whose cameras hands over something else."""
+    device = getattr(station, role)
+    real = device.capture
+
+    def capture(*args):
+        got = real(*args)
+        return replace(got, **{name: how(getattr(got, name)) for name, how in change.items()})
+
+    device.capture = capture
+    return station
+
+
+def _some(points, value):
+    points[:2] = value
+    return points
+
+
+UNITS = [
+    ("stereo", {"points": lambda p: p * 1000}, "metres", "millimetres"),
+    ("stereo", {"points": lambda p: p / 1000}, "metres", "twice"),
+    ("stereo", {"points": lambda p: _some(p, 0)}, "zero never means missing", "0 for none"),
+    ("stereo", {"points": lambda p: _some(p, np.inf)}, "infinity", "inf for none"),
+    ("stereo", {"points": lambda p: _some(p, -1)}, "in front", "negative"),
+    ("stereo", {"points": lambda p: _some(p, 1e4)}, "beyond", "large number"),
+    ("stereo", {"points": lambda p: p.astype(np.float64)}, "float32", "conversion"),
+    ("tof", {"celsius": lambda c: c + 273.15}, "Celsius", "kelvin"),
+    ("tof", {"time_ns": lambda t: t + 1_700_000_000 * 10**9}, "monotonic", "time of day"),
+    ("tof", {"time_ns": lambda t: t.astype(np.float64)}, "int64", "seconds"),
+    ("tof", {"raw": lambda r: r.astype(np.float32)}, "as the sensor gave it", "conversion"),
+]
+
+
+@pytest.mark.parametrize(("role", "change", "clause", "cause"), UNITS, ids=[row[2] + row[3] for row in UNITS])
+def test_a_drivers_wrong_units_are_refused_at_the_first_view(tmp_path, role, change, clause, cause):
+    """What the conformance suite knows, the recorder holds the first view against: by name, with the likely cause."""
+    with pytest.raises(ConfigError, match=rf"\[{role}\].*{clause}") as told:
+        record(_change(Bench().station(), role, **change), "mug", tmp_path, views=2, frames=2)
+    assert cause in told.value.hint
+    assert not list(tmp_path.rglob("view-*.h5"))
+
+
+@pytest.mark.parametrize(
+    ("change", "clause"),
+    [
+        ({"phase_rad": (0.0, 90.0, 180.0, 270.0) * 2}, "radians"),
+        ({"exposure": 400.0}, "seconds"),
+        ({"illuminator": np.array([0.0, 15.0, 0.0])}, "metres"),
+    ],
+)
+def test_a_description_in_other_units_is_refused(change, clause):
+    """Degrees, microseconds, millimetres."""
+    with pytest.raises(ConfigError, match=clause):
+        check_tof_info(replace(Bench().station().tof.describe(), **change))
+
+
+@pytest.mark.parametrize(
+    ("change", "clause"),
+    [
+        ({"joints": np.degrees(HOME)}, "radians"),
+        ({"time_ns": 1.5}, "whole number"),
+        ({"joints": HOME[:5]}, "6"),
+    ],
+)
+def test_an_arm_in_other_units_is_refused(tmp_path, change, clause):
+    """Degrees, seconds as floats, five joints."""
+    station = Bench().station()
+    real = station.arm.move_to
+    station.arm.move_to = lambda joints: replace(real(joints), **change)
+    with pytest.raises(ConfigError, match=clause):
+        record(station, "mug", tmp_path, views=2, frames=2)
