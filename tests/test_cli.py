@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -183,3 +184,60 @@ def _taken(given):
             list(x) if isinstance(x, range | set | tuple) else x for x in told
         ]
     return found
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        {"PYTHONIOENCODING": "ascii"},
+        {"PYTHONIOENCODING": "latin-1"},
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    ],
+)
+def test_any_locale_shows_any_folder(tmp_path, env):
+    """A folder with a Greek name is written to and named, whatever the terminal can print."""
+    folder = tmp_path / "Größe-δ"
+    folder.mkdir()
+    command = [sys.executable, "-m", "tofcapture", "config", "show", "--station", str(folder / "none.toml")]
+    done = subprocess.run(command, capture_output=True, env={**os.environ, **env}, check=False)
+    assert done.returncode == 3
+    assert b"none.toml" in done.stderr
+    assert b"Traceback" not in done.stderr
+    write = "from tofcapture.cli.kit import written; from pathlib import Path; import sys; written({}, '', Path(sys.argv[1]) / 'r.json')"
+    subprocess.run([sys.executable, "-c", write, str(folder)], env={**os.environ, **env}, check=True)
+    assert (folder / "r.json").exists()
+
+
+def test_code_that_cannot_be_kept_is_compiled_all_the_same(monkeypatch):
+    """A user without a home folder has no place for machine code: it is made anew, and the doctor sees it."""
+    from numba.core import caching
+
+    from tofcapture import libraries
+    from tofcapture.cli.probe import probe_kernels
+
+    assert libraries.keeps_kernels()
+    monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
+    assert libraries.compiled(lambda x: x + 1)(2) == 3
+    (found,) = probe_kernels()
+    assert found.verdict == "WARN"
+    assert "NUMBA_CACHE_DIR" in found.advice
+
+
+def test_no_home_is_named(monkeypatch, tmp_path):
+    """Without a home folder, or where it cannot be written, the daemon's folder has to be given."""
+    from tofcapture.errors import ConfigError
+    from tofcapture.record.daemon import settings
+
+    for name in ("TOFCAPTURE_STATE", "STATE_DIRECTORY", "XDG_STATE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+
+    def none():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(settings.Path, "home", none)
+    with pytest.raises(ConfigError, match="home") as told:
+        settings.state_folder(None)
+    assert "--state" in told.value.hint
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="cannot be made"):
+        settings.open_folder(tmp_path / "file" / "st")

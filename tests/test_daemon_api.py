@@ -1,5 +1,6 @@
 """The daemon's API: who may ask, what is refused and how, and a recording from the queue to the sealed view."""
 
+import contextlib
 import dataclasses
 import http.client
 import json
@@ -7,6 +8,7 @@ import os
 import select
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
@@ -524,3 +526,88 @@ def test_openapi_is_what_is_served(daemon):
     assert stored == document() == daemon.ask("GET", "/openapi.json"), "make docs"
     known = {field.name for field in dataclasses.fields(Job)}
     assert stored["components"]["schemas"]["Job"]["properties"].keys() == known
+
+
+@pytest.mark.parametrize("fault", ["closed", "unexpected", "millimetres"])
+def test_the_queue_does_not_burn(tmp_path, fault):
+    """What the next job would meet as well puts the job back and rests; with the cause gone all jobs are done."""
+    (tmp_path / "fault").write_text(fault)
+    with running(tmp_path, BENCH_FAULT=tmp_path / "fault") as daemon:
+        for number in range(3):
+            daemon.record(1, recording=f"r{number}")
+        state = daemon.wait(lambda s: s["phase"] == "paused")
+        assert state["queue"] == {"queued": 3}
+        assert {"closed": "do not open", "unexpected": "LookupError", "millimetres": "metres"}[
+            fault
+        ] in state["reason"]
+        (tmp_path / "fault").unlink()
+        daemon.ask("POST", "/v1/resume")
+        daemon.wait(lambda s: s["queue"] == {"done": 3})
+
+
+def test_an_unmounted_root_is_not_recorded_into(tmp_path):
+    """The disk goes while a view is taken: the queue rests, the empty folder in its place stays empty, the disk comes back."""
+    with running(tmp_path, **_held(tmp_path, 4)) as daemon:
+        daemon.record(3)
+        daemon.wait(lambda s: s["progress"]["sealed"] == 1 and s["doing"])
+        daemon.root.rename(tmp_path / "away")
+        daemon.root.mkdir()
+        (tmp_path / "hold").unlink()
+        for _ in range(2):  # a resume changes nothing while the disk is away
+            state = daemon.wait(lambda s: s["phase"] == "paused")
+            assert "unmounted" in state["reason"]
+            assert state["queue"] == {"queued": 1}
+            daemon.ask("POST", "/v1/resume")
+        daemon.wait(lambda s: s["phase"] == "paused")
+        assert not list(daemon.root.iterdir())
+        daemon.root.rmdir()
+        (tmp_path / "away").rename(daemon.root)
+        daemon.ask("POST", "/v1/resume")
+        assert daemon.wait(_over)["job"]["state"] == "done"
+    assert len(list((tmp_path / "root").rglob("view-*.h5"))) == 3
+
+
+def test_a_held_or_full_queue_answers_at_once(tmp_path):
+    """Another process holds the database, or its disk is full: answers come as JSON, and nothing waits."""
+    with running(tmp_path, BENCH_STATE=tmp_path / "full") as daemon:
+        daemon.ask("POST", "/v1/pause")
+        job = json.dumps(GOOD)
+        with contextlib.closing(sqlite3.connect(daemon.state / "queue.sqlite", isolation_level=None)) as db:
+            db.execute("BEGIN IMMEDIATE")
+            begin = time.monotonic()
+            assert daemon.ask("GET", "/v1/state")["phase"] == "paused"
+            status, answer, _ = daemon.tcp("POST", "/v1/jobs", VERB, job)
+            assert (status, answer["error"]["kind"]) == (409, "BusyError")
+            assert time.monotonic() - begin < 4  # s; SQLite would wait for 5
+            daemon.ask("POST", "/v1/stop")
+            db.execute("ROLLBACK")
+        (tmp_path / "full").write_text("1")
+        status, answer, _ = daemon.tcp("POST", "/v1/jobs", VERB, job)
+        assert (status, answer["error"]["kind"]) == (507, "DiskFull")
+        (tmp_path / "full").unlink()
+        assert daemon.tcp("POST", "/v1/jobs", VERB, job)[0] == 201
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"GARBAGE\r\n\r\n",
+        b"GET / HTTP/9.9\r\n\r\n",
+        b"GET /" + b"x" * 20000 + b" HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nContent-Length: -1\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01",
+        b"POST /v1/jobs HTTP/1.1\r\nHost: HOST\r\nX-Tofcapture: 1\r\nAuthorization: Bearer TOKEN\r\nContent-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n\r\n",
+    ],
+)
+def test_what_is_no_http_is_refused_in_json(daemon, sent):
+    """aiohttp's own refusals look like all others."""
+    host = f"127.0.0.1:{daemon.port}".encode()
+    with socket.create_connection(("127.0.0.1", daemon.port), timeout=PATIENCE) as link:
+        link.sendall(sent.replace(b"HOST", host).replace(b"TOKEN", daemon.token.encode()) + b"\n\n")
+        answer = b""
+        while part := link.recv(4096):
+            answer += part
+    head, _, body = answer.partition(b"\r\n\r\n")
+    assert head.split()[1] == b"400"
+    assert b"application/json" in head
+    assert set(json.loads(body)["error"]) == {"kind", "message", "hint"}

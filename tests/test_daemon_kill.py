@@ -32,3 +32,12 @@ def test_daemon_recorder_and_host_are_killed_in_simulated_recordings():
     """Thirty kills and four full disks, of which each of the three processes has its share."""
     told = _strike("--kills", "30", "--full", "4", "--seed", "3", seconds=1700)
     assert {"daemon", "recorder", "host"} <= told["blows"].keys()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_night_with_faults_of_all_kinds():
+    """An hour of compressed time: disks, folders, devices, databases and processes fail; no job fails for it, nothing is lost."""
+    told = _strike("--hours", "1", "--seed", "5", seconds=1700)
+    assert told["sealed"] == 25 * (told["jobs"] + 1)
+    assert len(told["faults"]) > 8

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import re
 import signal
 import socket
 import sqlite3
@@ -273,3 +274,26 @@ def test_cli_without_a_daemon(tmp_path, capsys):
     assert "Type=notify" in unit
     assert "--allow-motion" not in unit
     assert "WatchdogSec=20" in unit
+
+
+def test_a_damaged_queue_is_named(tmp_path, capsys):
+    """The daemon does not start on a damaged queue: it names the file and what to do, exit code 5."""
+    pytest.importorskip("aiohttp")
+    state = settings.open_folder(tmp_path / "s")
+    store.Store(state.database).close()
+    data = bytearray(state.database.read_bytes())
+    data[4096:4700] = bytes(604)
+    state.database.write_bytes(data)
+    assert main(["daemon", "--root", str(tmp_path / "r"), "--state", str(tmp_path / "s")]) == 5
+    assert re.search(r"queue\.sqlite.*\n.*move it away", capsys.readouterr().err)
+
+
+def test_the_token_reaches_no_log(tmp_path, capsys, monkeypatch):
+    """The page's address carries the token on a terminal only."""
+    from tofcapture.cli.daemon import _announce
+
+    _announce(tmp_path / "sock", "http://127.0.0.1:1/#token=secret")
+    assert "secret" not in capsys.readouterr().err
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    _announce(tmp_path / "sock", "http://127.0.0.1:1/#token=secret")
+    assert "secret" in capsys.readouterr().err

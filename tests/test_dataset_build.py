@@ -425,6 +425,30 @@ build_dataset([Path({str(recording)!r})], Path({str(out)!r}), jobs=1, progress=d
             assert sha256_of(out / name) == sha256_of(tmp_path / "calm" / name)
 
 
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_sigterm_prints_one_line(recording, tmp_path, jobs):
+    """Told to end, alone or with its workers, a build says so in one line and its hint, and leaves no half shard."""
+    code = f"""
+import os, signal, sys, threading, time
+from pathlib import Path
+from tofcapture.cli import main
+def end():
+    while not list(Path({str(tmp_path)!r}).glob("d/shards/.work-*")):
+        time.sleep(0.01)
+    os.killpg(0, signal.SIGTERM)
+if __name__ == "__main__":
+    threading.Thread(target=end, daemon=True).start()
+    sys.exit(main(["build-dataset", {str(recording)!r}, "--true-rig", "--out", {str(tmp_path / "d")!r}, "--jobs", {jobs!r}]))
+"""
+    (tmp_path / "run.py").write_text(code)
+    command = [sys.executable, tmp_path / "run.py"]
+    done = subprocess.run(command, capture_output=True, text=True, start_new_session=True, check=False)
+    assert done.returncode == 143
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("build")]
+    assert lines == ["tofcapture: terminated", "  try: run the same command again to go on"]
+    assert not list((tmp_path / "d").glob("shards/*.h5"))
+
+
 def test_the_command(recording, tmp_path):
     """`tofcapture build-dataset --true-rig --json` states scenes, views and the ground truth's error."""
     args = [

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
+import os
+
 import numpy as np
 import pytest
 
 pytest.importorskip("torch")
 
 from tofcapture.camera import Camera
+from tofcapture.files.disk import DiskFull
 from tofcapture_model.inference.prediction import Prediction, write_prediction
 
 CAMERA = Camera(6, 4, 5.0, 5.5, 2.5, 1.0)
@@ -68,3 +72,22 @@ def test_arrays_are_what_was_predicted(written, name):
     """To the bit."""
     prediction, folder = written
     np.testing.assert_array_equal(np.load(folder / f"{name}.npy"), getattr(prediction, name))
+
+
+@pytest.mark.parametrize("number", [1, 3, 5, 8, 13])
+def test_a_full_disk_leaves_no_file_cut_short(written, tmp_path, monkeypatch, number):
+    """Full at any write, it is named, and each file under its final name is whole."""
+    prediction, whole = written
+    real, count = os.fsync, iter(range(1, 100))
+
+    def full(handle):
+        if next(count) >= number:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(DiskFull):
+        write_prediction(prediction, tmp_path / "out")
+    left = list((tmp_path / "out").iterdir())
+    assert len(left) == number // 2
+    assert all(path.read_bytes() == (whole / path.name).read_bytes() for path in left)

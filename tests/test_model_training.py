@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -19,7 +20,7 @@ torch = pytest.importorskip("torch")
 from tests import PATIENCE
 from tests.analytic import make_dataset
 from tofcapture.cli import main
-from tofcapture.errors import ConfigError, DataError, FormatError
+from tofcapture.errors import BusyError, ConfigError, DataError, FormatError
 from tofcapture.files.cache import pack
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Network, Stage, preset
@@ -85,6 +86,53 @@ def test_a_stopped_run_goes_on_to_the_same_bits(dataset, tiny, trained, tmp_path
     again = train(tiny, dataset, out)
     assert again.finished
     assert again.steps == resumed.steps
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_goes_on_to_the_same_bits(dataset, tiny, trained, tmp_path, number):
+    """Ctrl-C in the first minute, in the middle of a step: the step is ended, a resume point written, and nothing is lost."""
+    out, steps = tmp_path / "run", []
+
+    def told(*_):
+        steps.append(1)
+        signal.raise_signal(number)
+
+    def end(*_):
+        raise KeyboardInterrupt
+
+    usual = signal.signal(number, end)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            train(tiny, dataset, out, report=told)
+        assert signal.getsignal(number) is end
+    finally:
+        signal.signal(number, usual)
+    assert (out / "resume.safetensors").exists()
+    assert len(steps) == 1
+    assert train(tiny, dataset, out).steps == trained[1].steps
+    for a, b in zip(
+        load_model(out)[0].state_dict().values(), load_model(trained[0])[0].state_dict().values(), strict=True
+    ):
+        assert torch.equal(a, b)
+
+
+def test_two_runs_do_not_share_a_folder(dataset, tiny, tmp_path):
+    """The second one is told who trains there, and touches nothing; a folder that cannot be written is named first."""
+    out = tmp_path / "run"
+
+    def second(*_):
+        before = {p: p.stat().st_mtime_ns for p in out.rglob("*")}
+        with pytest.raises(BusyError, match=str(os.getpid())):
+            train(tiny, dataset, out)
+        assert {p: p.stat().st_mtime_ns for p in out.rglob("*")} == before
+        told.append(1)
+
+    told = []
+    train(tiny, dataset, out, report=second)
+    assert told
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="no folder"):
+        train(tiny, dataset, tmp_path / "file")
 
 
 def test_another_configuration_does_not_continue_a_run(dataset, tiny, trained):

@@ -219,7 +219,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(err, ModuleNotFoundError):
             hint = "pip install 'tofcapture[all]'"
             return _failed("Missing", f"the library {err.name} is missing", hint, 3, as_json=as_json)
-        hint = "set TOFCAPTURE_TRACEBACK=1 to see where"
+        from tofcapture.files.disk import is_full
+
+        full = "free some space, then run the same command again"
+        hint = full if is_full(err) else "set TOFCAPTURE_TRACEBACK=1 to see where"
         return _failed(type(err).__name__, str(err), hint, 1, as_json=as_json)
     told = f"\n  next: {outcome.following}" if outcome.following and outcome.exit_code == 0 else ""
     _tell(json.dumps(outcome.data, allow_nan=False, default=str) if as_json else outcome.text + told)

@@ -180,7 +180,7 @@ class Database:
 
 def _look_over(db: sqlite3.Connection) -> None:
     if (said := db.execute("PRAGMA integrity_check(1)").fetchone()[0]) != "ok":
-        raise sqlite3.DatabaseError(said)
+        raise sqlite3.DatabaseError(str(said).splitlines()[-1])
 
 
 def _no_damage(path: Path, err: Exception) -> TofError | None:
