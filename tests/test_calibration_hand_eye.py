@@ -10,10 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calibration.hand_eye import clocks
 from calibration.hand_eye.checks import Cause, HandEyeRefused
 from calibration.hand_eye.closed_form import invert_all, park_martin, residuals, rotation_bound, shah
 from calibration.hand_eye.files import read_pairs, read_poses
 from calibration.hand_eye.pairs import make_stream, stream_pairs
+from calibration.hand_eye.readings import agreed
 from calibration.hand_eye.refine import jacobian, refined_from_consensus
 from calibration.hand_eye.solve import solve_hand_eye, to_dict
 from tests.hand_eye import apart, station, streams
@@ -220,7 +222,7 @@ def test_damaged_poses_are_data_errors(spoil, says):
 @pytest.mark.skipif(not MOVEIT.exists(), reason="needs ../shared/realdata")
 def test_moveit_gives_the_published_answer():
     """MoveIt's real pairs give its published translation within 1 % and rotation within 1 %; eye-in-hand fails by name."""
-    hand, target, _ = read_pairs(MOVEIT)
+    hand, target, _ = agreed(*read_pairs(MOVEIT))
     result = solve_hand_eye(hand, target, eye_to_hand=True)
     rx, ry, rz = (rotation_exp(a * e) for a, e in zip((0.230, -2.540, 1.950), np.eye(3), strict=True))
     truth = transform(rx @ ry @ rz, [0.659, -0.249, 0.830])
@@ -245,15 +247,47 @@ def test_eth_streams_repeat():
     assert refused(A, invert_all(B)) == Cause.TARGET_INVERTED
 
 
-@pytest.mark.parametrize("offset", [0.137, 1e6])
-def test_time_offset_is_found(offset):
-    """Clocks that differ by a few frames or by an epoch are brought together to two milliseconds."""
-    hand, target, X = streams(offset)
+CLOCKS = {
+    "seconds": (lambda t: t, 0.0, "s,"),
+    "an epoch apart": (lambda t: t + 1.7e9, 1.7e9, "s,"),
+    "nanoseconds of an epoch": (lambda t: np.round(1e9 * (t + 1.7e9)), 1.7e9, "ns,"),
+    "milliseconds since boot": (lambda t: 1e3 * t, 0.0, "ms,"),
+    "a zero among wall-clock times": (
+        lambda t: np.where(np.arange(len(t)) == 500, 0, t + 1.7e9),
+        1.7e9,
+        "stray",
+    ),
+    "steps back": (lambda t: np.where(np.arange(len(t)) < 1400, t, t - 5), 0.0, "steps back"),
+}
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_time_offset_is_found(clock):
+    """Clocks of any unit and origin, with stray stamps or a step, are brought together to a millisecond, and what they had is said."""
+    change, origin, says = CLOCKS[clock]
+    hand, target, X = streams(0.137)
+    hand = make_stream(change(hand.seconds), hand.poses, "hand")
     A, B, found = stream_pairs(hand, target)
-    assert abs(found["time_offset_s"] - offset) < 0.002
-    assert found["time_offset_sigma_s"] < 0.002
-    assert found["correlation"] > 0.8
+    assert abs(found["time_offset_s"] - 0.137 - origin) < 0.001
+    assert found["time_offset_sigma_s"] < 0.001
+    assert says in "; ".join(found["clocks"]["hand"])
     assert apart(solve_hand_eye(A, B, blocks=10).X, X)[1] < 0.002
+
+
+@pytest.mark.parametrize("unit", clocks.SECONDS)
+@pytest.mark.parametrize("origin", [0.0, 1e6, 1.76e9])
+def test_stamps_tell_their_unit(unit, origin):
+    """Nano- to whole seconds are told by their step, whatever the origin; a permutation of the rows is put in order."""
+    rng = np.random.default_rng(0)
+    t = origin + 0.02 * np.arange(300)
+    R = np.stack([exp([0, 0, 0, 0.3 * np.sin(x), 0.2 * np.cos(x), 0])[:3, :3] for x in 0.02 * np.arange(300)])
+    mixed = rng.permutation(300)
+    found = clocks.read_clock(t[mixed] / clocks.SECONDS[unit], R[mixed], "hand")
+    assert found.unit == unit
+    np.testing.assert_array_equal(mixed[found.kept], np.arange(300))
+    np.testing.assert_allclose(found.seconds, t, atol=1e-5)
+    with pytest.raises(DataError, match="at least 10 poses"):
+        clocks.read_clock(np.zeros(300), R, "hand")
 
 
 def test_time_offset_of_foreign_or_periodic_streams_is_refused():

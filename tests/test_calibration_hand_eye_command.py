@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import yaml
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from calibration.hand_eye.files import read_pairs, read_poses, readings_of
+from calibration.hand_eye.readings import agreed
 from tests import answers
 from tests.commands import calibrate
 from tests.hand_eye import apart, station, streams
@@ -19,7 +22,7 @@ from tofcapture.devices.sim.world import SimWorld, read_constants
 from tofcapture.errors import DataError, FormatError, QualityError, UsageError
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, View
-from tofcapture.poses import exp, invert, look_at, rotation_exp
+from tofcapture.poses import exp, invert, look_at, rotation_exp, rotation_log, transform
 
 HAND, TARGET, X = station(3, 15)
 SMALL = {
@@ -100,7 +103,51 @@ def moveit(a, b):
 
 
 MATRICES = json.dumps(pairs(HAND.tolist(), TARGET.tolist()))
+R_HAND, R_TARGET = HAND[:, :3, :3], TARGET[:, :3, :3]
+T_HAND, T_TARGET = HAND[:, :3, 3:], TARGET[:, :3, 3:]
+OPENCV = {
+    "R_gripper2base": R_HAND,
+    "t_gripper2base": T_HAND,
+    "R_target2cam": R_TARGET,
+    "t_target2cam": T_TARGET,
+}
+
+
+def file_storage(path, *, numbered=False):
+    """OpenCV's own file of the four lists of calibrateHandEye, as sequences or one name a matrix."""
+    out = cv2.FileStorage(str(path), cv2.FileStorage_WRITE)
+    for name, values in OPENCV.items():
+        if not numbered:
+            out.startWriteStruct(name, cv2.FileNode_SEQ)
+        for i, value in enumerate(values):
+            out.write(f"{name}_{i}" if numbered else "", np.ascontiguousarray(value))
+        if not numbered:
+            out.endWriteStruct()
+    out.release()
+
+
 PAIRS = {
+    "storage.yml": file_storage,
+    "storage.xml": file_storage,
+    "storage.json": file_storage,
+    "numbered.xml": lambda p: file_storage(p, numbered=True),
+    "opencv.npz": lambda p: np.savez(p, **OPENCV),
+    "opencv.mat": lambda p: savemat(p, OPENCV),
+    "lists of (3, 1).json": lambda p: p.write_text(json.dumps({k: v.tolist() for k, v in OPENCV.items()})),
+    "rvecs.npz": lambda p: np.savez(
+        p,
+        R_base2gripper=R_HAND.swapaxes(1, 2),
+        t_base2gripper=-R_HAND.swapaxes(1, 2) @ T_HAND,
+        rvecs=Rotation.from_matrix(R_TARGET).as_rotvec()[..., None],
+        tvecs=T_TARGET,
+    ),
+    "decimal commas.csv": lambda p: p.write_text(
+        text(np.c_[rows(HAND), rows(TARGET)], "", ";").replace(".", ",")
+    ),
+    "windows.csv": lambda p: p.write_bytes(text(np.c_[rows(HAND), rows(TARGET)]).encode("utf-16")),
+    "twelve.csv": lambda p: p.write_text(
+        text(np.c_[euler(HAND, "rotvec", degrees=False), euler(TARGET, "rotvec", degrees=False)])
+    ),
     "matrices.json": lambda p: p.write_text(MATRICES),
     "moveit.yaml": lambda p: p.write_text(yaml.safe_dump([moveit(*ab) for ab in pairs(HAND, TARGET)])),
     "lists.json": lambda p: p.write_text(
@@ -118,12 +165,16 @@ PAIRS = {
 
 @pytest.mark.parametrize("name", PAIRS)
 def test_files_of_pairs_give_the_pairs(tmp_path, name):
-    """Every form of pairs gives the poses that were written, and nothing had to be decided."""
+    """Every form of pairs gives the poses that were written, and nothing but what no file says had to be decided."""
     PAIRS[name](tmp_path / name)
-    hand, target, said = read_pairs(tmp_path / name)
+    hand, target, meant = agreed(*read_pairs(tmp_path / name))
     np.testing.assert_allclose(hand, HAND, atol=1e-6)
     np.testing.assert_allclose(target, TARGET, atol=1e-6)
-    assert said == {}
+    unsaid = {
+        k: v for k, v in meant.said.items() if v not in {"rotation vectors", "inverted, as its name says"}
+    }
+    assert unsaid == {}
+    assert meant.rivals == ()
 
 
 @pytest.mark.parametrize(("hand", "target"), [("wxyz", "xyzw"), ("xyzw", "wxyz"), ("wxyz", "wxyz")])
@@ -131,11 +182,123 @@ def test_the_order_of_quaternions_is_found(tmp_path, hand, target):
     """Scalar first or last is told by which of them moves rigidly with the other side."""
     path = tmp_path / "pairs.json"
     path.write_text(json.dumps(pairs(rows(HAND, hand).tolist(), rows(TARGET, target).tolist())))
-    A, B, said = read_pairs(path)
+    A, B, meant = agreed(*read_pairs(path))
     np.testing.assert_allclose(A, HAND, atol=1e-6)
     np.testing.assert_allclose(B, TARGET, atol=1e-6)
     given = {"hand": hand, "target": target}
-    assert said == {who: "quaternions wxyz" for who, order in given.items() if order == "wxyz"}
+    assert {k: v.split(" (")[0] for k, v in meant.said.items()} == {
+        who: "quaternions wxyz" for who, order in given.items() if order == "wxyz"
+    }
+
+
+def euler(poses, order, *, degrees=True, scale=1.0):
+    """(N, 6) translation and Euler angles or, as ``rotvec``, rotation vectors."""
+    R = Rotation.from_matrix(poses[:, :3, :3])
+    turn = R.as_rotvec(degrees=degrees) if order == "rotvec" else R.as_euler(order, degrees=degrees)
+    return np.c_[scale * poses[:, :3, 3], turn]
+
+
+READ_AS = {
+    "Euler angles under rx,ry,rz": (
+        "x,y,z,rx,ry,rz\n",
+        lambda T: euler(T, "xyz"),
+        "Euler angles xyz, fixed axes, degrees",
+    ),
+    "another order under roll,pitch,yaw": (
+        "x,y,z,roll,pitch,yaw\n",
+        lambda T: euler(T, "ZYX"),
+        "ZYX, turning axes, degrees",
+    ),
+    "radians without a header": ("", lambda T: euler(T, "YXZ", degrees=False), "YXZ, turning axes"),
+    "proper Euler angles": ("", lambda T: euler(T, "ZYZ"), "ZYZ, turning axes, degrees"),
+    "KUKA": (
+        "X,Y,Z,A,B,C\n",
+        lambda T: euler(T, "ZYX", scale=1e3),
+        "ZYX, turning axes, degrees, millimetres",
+    ),
+    "rotation vectors in degrees": (
+        "x,y,z,rx,ry,rz\n",
+        lambda T: euler(T, "rotvec"),
+        "rotation vectors, degrees",
+    ),
+    "centimetres": ("", lambda T: rows(T, scale=100), "centimetres"),
+    "JPL quaternions": ("", lambda T: rows(T) * [1, 1, 1, -1, -1, -1, 1], "inverted"),
+    "columns": ("", lambda T: T.swapaxes(1, 2).reshape(-1, 16), "by columns"),
+    "mm in the header": (
+        "x [mm],y [mm],z [mm],rx [rad],ry [rad],rz [rad]\n",
+        lambda T: euler(T, "rotvec", degrees=False, scale=1e3),
+        "millimetres",
+    ),
+}
+
+
+@pytest.mark.parametrize("form", READ_AS)
+def test_conventions_are_found_and_said(tmp_path, form):
+    """Whatever a program writes for the hand, both sides or a header that says otherwise: the poses are found, and what was taken is said."""
+    header, write, says = READ_AS[form]
+    (tmp_path / "hand.csv").write_text(text(write(HAND), header))
+    (tmp_path / "target.csv").write_text(text(rows(TARGET, scale=100 if form == "centimetres" else 1)))
+    hand, target, meant = agreed(read_poses(tmp_path / "hand.csv"), read_poses(tmp_path / "target.csv"))
+    np.testing.assert_allclose(hand, HAND, atol=1e-5)
+    np.testing.assert_allclose(target, TARGET, atol=1e-5)
+    assert says in meant.said["hand"]
+    assert meant.rivals == ()
+
+
+def test_small_tilts_tell_euler_angles_from_rotation_vectors(tmp_path):
+    """Hand angles below 15 degrees, where the readings differ by a degree at most, are told apart in either header's favour."""
+    near = np.stack([transform(np.eye(3), [0.5, 0.1, 0.4]) @ invert(HAND[0]) @ T for T in HAND])
+    small = np.stack([transform(rotation_exp(0.15 * rotation_log(T[:3, :3])), T[:3, 3]) for T in near])
+    Z = transform(np.eye(3), [0.5, 0.0, 0.8])
+    seen = np.stack(
+        [
+            invert(X) @ invert(T) @ Z @ exp(e)
+            for T, e in zip(small, np.random.default_rng(0).normal(0, 4e-4, (15, 6)), strict=True)
+        ]
+    )
+    target = readings_of(rows(seen).tolist(), "target")
+    for order in ("xyz", "ZYX", "XYZ", "rotvec"):
+        (tmp_path / "hand.csv").write_text(text(euler(small, order), "x,y,z,rx,ry,rz\n"))
+        hand, _, _ = agreed(read_poses(tmp_path / "hand.csv"), target)
+        np.testing.assert_allclose(hand, small, atol=1e-5)
+
+
+def test_what_cannot_be_told_is_asked_for(tmp_path):
+    """Inches look like centimetres, a mirrored frame has three axes: both are refused, and --read-as decides the first."""
+    for name, T in (("hand.csv", HAND), ("target.csv", TARGET)):
+        (tmp_path / name).write_text(text(rows(T, scale=1 / 0.0254)))
+    files = tmp_path / "hand.csv", tmp_path / "target.csv"
+    with pytest.raises(QualityError, match=r"centimetres .* as likely as in inches") as caught:
+        calibrate("hand-eye", *files)
+    assert "--read-as" in caught.value.hint
+    data = calibrate("hand-eye", *files, "--read-as", "both=in").data
+    assert apart(np.array(data["T_flange_camera"]), X)[1] < 0.002
+    with pytest.raises(UsageError, match="--read-as"):
+        calibrate("hand-eye", *files, "--read-as", "hand=furlongs")
+    S = np.diag([1.0, -1.0, 1.0, 1.0])
+    files[0].write_text(text(euler(S @ HAND @ S, "YXZ")))
+    files[1].write_text(text(rows(TARGET)))
+    with pytest.raises(QualityError, match="mirrored"):
+        calibrate("hand-eye", *files)
+
+
+def test_a_wrong_target_size_fails_unless_it_is_accepted(tmp_path):
+    """A target 6 % off exits with 6 and the squares that would fit, its result written; free uses that size, 1 the given one."""
+    large = TARGET.copy()
+    large[:, :3, 3] *= 1.06
+    path, out = tmp_path / "pairs.json", tmp_path / "result.json"
+    path.write_text(json.dumps(pairs(HAND.tolist(), large.tolist())))
+    failed = calibrate("hand-eye", path, "--out", out)
+    assert failed.exit_code == 6
+    assert json.loads(out.read_text())["verdict"] == "FAIL"
+    assert "25 mm given become 23.5" in failed.text
+    free, given = (calibrate("hand-eye", path, "--target-scale", word) for word in ("free", "1"))
+    assert free.exit_code == given.exit_code == 0
+    assert apart(np.array(free.data["T_flange_camera"]), X)[1] < 0.002
+    assert apart(np.array(given.data["T_flange_camera"]), X)[1] > 0.01
+    assert given.data["verdict"] == "WARN"
+    with pytest.raises(UsageError, match="free or a factor"):
+        calibrate("hand-eye", path, "--target-scale", "big")
 
 
 STREAMS = {
@@ -150,6 +313,21 @@ STREAMS = {
         "t, x [m], y [m], z [m], roll (deg), pitch (deg), yaw (deg)\n",
     ),
     "matrix": lambda t, T: text(np.c_[t, T[:, :3].reshape(-1, 12)]),
+    "rostopic echo -p": lambda t, T: (
+        "%time,field.header.seq,field.header.stamp,field.header.frame_id,"
+        + ",".join(f"field.pose.position.{c}" for c in "xyz")
+        + ","
+        + ",".join(f"field.pose.orientation.{c}" for c in "xyzw")
+        + "\n"
+        + "".join(
+            f"0,{i},{s:.9g},base," + ",".join(f"{x:.9g}" for x in row) + "\n"
+            for i, (s, row) in enumerate(zip(t, rows(T), strict=True))
+        )
+    ),
+    "UR": lambda t, T: "".join(
+        f"[{s:.9g}, " + ", ".join(f"{x:.9g}" for x in row) + "],\n"
+        for s, row in zip(t, euler(T, "rotvec", degrees=False), strict=True)
+    ),
     "json": lambda t, T: json.dumps({"seconds": t.tolist(), "poses": rows(T).tolist()}),
 }
 
@@ -162,7 +340,6 @@ def test_tables_of_poses_are_read(tmp_path, form):
     found = read_poses(path)
     np.testing.assert_allclose(found.usual, HAND, atol=1e-6)
     np.testing.assert_allclose(found.seconds, np.arange(len(HAND)) * 0.1)
-    assert found.millimetres == (form == "millimetres")
 
 
 def test_command_reads_pairs_and_writes_json(tmp_path):
@@ -194,7 +371,7 @@ def test_command_solves_two_files_without_times(tmp_path):
     (tmp_path / "target.csv").write_text(text(rows(TARGET)))
     outcome = calibrate("hand-eye", tmp_path / "hand.csv", tmp_path / "target.csv")
     assert np.abs(np.array(outcome.data["T_flange_camera"]) - X).max() < 0.005
-    assert outcome.data["read_as"] == {"hand": "quaternions wxyz, millimetres"}
+    assert outcome.data["read_as"]["hand"].startswith("quaternions wxyz, millimetres")
     assert "millimetres" in outcome.text
 
 
@@ -223,8 +400,10 @@ def test_command_finds_the_offset_of_streams(tmp_path):
         ("pairs.yaml", "a: [", FormatError, "YAML"),
         ("pairs.npz", "no arrays", FormatError, "arrays"),
         ("pairs.npz", "PK\x03\x04 cut", FormatError, "arrays"),
-        ("pairs.csv", "\udcff\udcfe", FormatError, "text"),
+        ("pairs.csv", "\udcff\udcff", FormatError, "text"),
         ("pairs.csv", "1,2,3,0,0,0,1\n", FormatError, "two poses"),
+        ("pairs.bag", "#ROSBAG V2.0", FormatError, "got .bag"),
+        ("pairs.xml", "<opencv_storage>", FormatError, "XML"),
         ("folder.csv", None, FormatError, "text"),
     ],
 )
@@ -264,9 +443,9 @@ def test_bad_tables_are_named(tmp_path, content, says):
     ("values", "kind", "says"),
     [
         ([], DataError, "none"),
-        ([[0.0] * 6] * 4, FormatError, "rotation vectors"),
+        ([[0.0] * 5] * 4, FormatError, "6 numbers"),
         ([[0.0] * 7, [0.0] * 16], FormatError, "one form"),
-        ([[0, 0, 0, 1, 1, 0, 0]], DataError, "unit quaternions"),
+        ([[0, 0, 2, 1, 1, 0, 0]], DataError, "unit quaternions"),
         ([{"translation": [0, 0, 0]}], FormatError, "rotation"),
         ([{"translation": {"x": 1}, "rotation": [0, 0, 0, 1]}], FormatError, "x, y, z"),
         ([["a"]], FormatError, "numbers"),

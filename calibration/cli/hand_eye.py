@@ -51,6 +51,13 @@ def configure_hand_eye(parser: argparse.ArgumentParser) -> None:
         help="the target's distances times FACTOR are believed (1: as given), or whatever fits (free); else a size that the pairs "
         "contradict by 3 sigma and 1 percent is solved for and fails",
     )
+    parser.add_argument(
+        "--read-as",
+        action="append",
+        default=[],
+        metavar="SIDE=WORDS",
+        help="how numbers are meant, where files do not say: hand=ZYX,deg or target=wxyz,mm or both=cm",
+    )
     parser.add_argument("--out", type=Path, metavar="RESULT.json", help="write the result here")
 
 
@@ -69,6 +76,8 @@ def run_hand_eye(args: argparse.Namespace) -> Outcome:
         target_scale=None if free else _factor(args.target_scale),
     )
     data = {**to_dict(result), **extra}
+    if extra.get("rivals") and data["verdict"] == "PASS":
+        data["verdict"] = "WARN"
     outcome = kit.written(data, _hand_eye_table(result, data), args.out)
     return replace(outcome, exit_code=QualityError.exit_code if result.failures else 0)
 
@@ -85,36 +94,46 @@ def _factor(text: str | None) -> float | None:
 
 def _pairs(args: argparse.Namespace) -> tuple[Float64, Float64, dict[str, Any], int | None]:
     """Hand and target poses, what is said of them, and how many blocks of a stream share their errors."""
-    from calibration.hand_eye.files import most_consistent, read_pairs, read_poses
-    from calibration.hand_eye.pairs import make_stream, recording_pairs, stream_pairs
+    from calibration.hand_eye.files import read_pairs, read_poses
+    from calibration.hand_eye.pairs import decided, recording_pairs
+    from calibration.hand_eye.readings import agreed
 
     paths = args.inputs
     if len(paths) == 1 and paths[0].is_dir():
         with kit.progress() as progress:
             hand, target = recording_pairs(paths[0], progress)
         return hand, _turned(target, args), {"camera": "stereo"}, None
-    if len(paths) == 1:
-        hand, target, said = read_pairs(paths[0])
-        return hand, _turned(target, args), {"read_as": said} if said else {}, None
-    if len(paths) != 2:
+    if len(paths) > 2:
         raise UsageError(
             f"expected one file of pairs, one recording, or two files of poses, got {len(paths)} paths"
         )
-    one, two = (read_poses(p) for p in paths)
+    one, two = read_pairs(paths[0]) if len(paths) == 1 else (read_poses(p) for p in paths)
+    one, two = one.narrowed(_read_as(args, "hand")), two.narrowed(_read_as(args, "target"))
     timed = one.seconds is not None and two.seconds is not None
     # Pose by pose, or the same times in both: pairs already.
     together = not timed or bool(np.array_equal(one.seconds, two.seconds))  # type: ignore[arg-type]
     if len(one) == len(two) and args.time_offset is None and together:
-        hand, target, said = most_consistent(one, two)
-        return hand, _turned(target, args), {"read_as": said} if said else {}, None
+        hand, target, meant = agreed(one, two)
+        return hand, _turned(target, args), meant.report(), None
     if one.seconds is None or two.seconds is None:
         raise DataError(
             f"expected as many poses in both files, or times before them, got {len(one)} and {len(two)} poses"
         )
-    moving = make_stream(one.seconds, one.usual, "hand poses")
-    seen = make_stream(two.seconds, _turned(two.usual, args), "target poses")
-    hand, target, found = stream_pairs(moving, seen, args.time_offset)
+    hand, target, found = decided(
+        one, replace(two, inverted=two.inverted ^ args.inverted_target), args.time_offset
+    )
     return hand, target, {"stream": True, **found}, min(STREAM_BLOCKS, len(hand) // 5)
+
+
+def _read_as(args: argparse.Namespace, side: str) -> list[str]:
+    """Words that ``--read-as hand=ZYX,deg`` says of a side."""
+    words = []
+    for given in args.read_as:
+        who, _, what = given.partition("=")
+        if who not in {"hand", "target", "both"} or not what:
+            raise UsageError(f"--read-as: expected hand=..., target=... or both=..., got {given!r}")
+        words += what.split(",") if who in {side, "both"} else []
+    return words
 
 
 def _turned(target: Float64, args: argparse.Namespace) -> Float64:
@@ -154,6 +173,8 @@ def _hand_eye_table(result: HandEye, data: dict[str, Any]) -> str:
     lines += [f"  {who} read as          {words}" for who, words in data.get("read_as", {}).items()]
     if "time_offset_s" in data:
         lines.append(f"  time offset           {1e3 * data['time_offset_s']:.1f} ms")
+        lines += [f"  {who + ' clock':22}{'; '.join(words)}" for who, words in data["clocks"].items()]
+    lines += [f"  rival reading         {words}" for words in data.get("rivals", ())]
     lines += [f"  FAIL: {text}" for text in data["failures"]]
     if result.failures:
         lines.append("        (--target-scale free uses the size that fits, --target-scale 1 the given one)")

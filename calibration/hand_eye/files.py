@@ -1,33 +1,31 @@
 """Read what hand-eye calibration is fed with: files of pairs, and files of poses, in the forms of other programs.
 
-Pairs: JSON, YAML (MoveIt's samples and alike), NPZ, or a table of two poses a line. Poses: a table with or without times (CSV,
-TUM), JSON, YAML, NPY or NPZ. A pose is a matrix, a translation with a quaternion in either order, a rotation vector or roll pitch
-yaw under a header, or a dictionary. What a file does not say is left open: :class:`Readings` holds every reading, and
-:func:`most_consistent` takes the pair of readings under which hand and target move rigidly together.
+Pairs: JSON, YAML (MoveIt's samples and alike), OpenCV's FileStorage, NPZ, MAT, or a table of two poses a line. Poses: a table with
+or without times (CSV, TUM, ``rostopic echo -p``, UR's and KUKA's arrays), or any of the former. A pose is a matrix, or a translation
+with a rotation in any numbers. What a file does not say is left open: :mod:`calibration.hand_eye.readings` decides it.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from collections.abc import Iterator, Mapping, Sequence, Sized
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 from zipfile import BadZipFile
 
 import numpy as np
 
-from calibration.hand_eye.closed_form import invert_all
-from calibration.hand_eye.refine import refined_from_consensus
+from calibration.hand_eye.readings import UNITS, Readings, angle_names
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.poses import Float64
 
 UNIT_LENGTH = 0.01  # a quaternion's length may be off one by this: printed with three digits
-FARTHEST = 20.0  # m; no arm and no board is farther, so larger numbers are millimetres
-CLEARER = 3.0  # log-likelihood per pair by which a reading must beat the usual one
-USUAL = "xyzw"
+ORTHOGONAL = 1e-2  # by which rows of a printed rotation may be off
 HAND = (
     "effector_wrt_world", "hand", "robot", "gripper2base", "t_gripper2base", "t_base_flange", "t_base_hand", "flange", "arm", "a",
 )  # fmt: skip
@@ -37,48 +35,56 @@ TARGET = (
 LISTS = ("samples", "pairs", "poses", "data", "transforms")
 SECONDS = ("seconds", "t", "time", "stamps")
 WRAPPED = ("transform", "pose", "matrix", "t_matrix", "homogeneous")
-TRANSLATION = ("translation", "position", "trans", "t", "xyz")
-ROTATION = ("rotation", "orientation", "quaternion", "rot", "q", "quat")
-HEADERS = {
-    ("qx", "qy", "qz", "qw"): "quaternion",
-    ("rx", "ry", "rz"): "vector",
-    ("roll", "pitch", "yaw"): "rpy",
+TRANSLATION = ("translation", "position", "trans", "t", "xyz", "tvec")
+ROTATION = ("rotation", "orientation", "quaternion", "rot", "q", "quat", "r", "rvec", "rmat")
+HEADERS = {  # what three angles or a quaternion are called -> the usual reading of them in that order
+    ("qx", "qy", "qz", "qw"): "xyzw",
+    ("rx", "ry", "rz"): "rotvec",
+    ("roll", "pitch", "yaw"): "xyz",
+    ("a", "b", "c"): "ZYX",  # KUKA: A about z
+    ("w", "p", "r"): "xyz",  # Fanuc
 }
 ALIASES = {
-    "w": "qw", "px": "x", "py": "y", "pz": "z", "tx": "x", "ty": "y", "tz": "z", "q_x": "qx", "q_y": "qy", "q_z": "qz", "q_w": "qw",
+    "px": "x", "py": "y", "pz": "z", "tx": "x", "ty": "y", "tz": "z", "q_x": "qx", "q_y": "qy", "q_z": "qz", "q_w": "qw",
     "time": "t", "timestamp": "t", "stamp": "t", "seconds": "t", "sec": "t", "rz_yaw": "yaw", "ox": "qx", "oy": "qy", "oz": "qz", "ow": "qw",
     "pos_x": "x", "pos_y": "y", "pos_z": "z", "quat_x": "qx", "quat_y": "qy", "quat_z": "qz", "quat_w": "qw", "i": "qx", "j": "qy",
     "k": "qz", "rot_x": "qx", "rot_y": "qy", "rot_z": "qz", "rot_w": "qw",
 }  # fmt: skip
+FRAMES = {  # OpenCV's and others' words for the four frames; its calibrateRobotWorldHandEye calls the target world
+    "hand": "gripper|hand|flange|tool|tool0|tcp|ee|eef|end_?effector",
+    "base": "base|robot_?base|robot",
+    "target": "target|board|marker|pattern|object|obj|tag|world|chessboard",
+    "camera": "camera|cam|sensor|eye|optical",
+}
+REMEDIES = {
+    ".bag": "rostopic echo -b FILE.bag -p /TOPIC > poses.csv, one file per topic",
+    ".mcap": "write the poses as CSV: t,x,y,z,qx,qy,qz,qw",
+    ".db3": "write the poses as CSV: t,x,y,z,qx,qy,qz,qw",
+    ".xlsx": "save the sheet as CSV",
+    ".xls": "save the sheet as CSV",
+    ".pkl": "numpy.savez('poses.npz', R_gripper2base=..., t_gripper2base=..., R_target2cam=..., t_target2cam=...)",
+    ".pickle": "numpy.savez('poses.npz', R_gripper2base=..., t_gripper2base=..., R_target2cam=..., t_target2cam=...)",
+    ".h5": "numpy.savez('poses.npz', hand=..., target=...) with (N, 4, 4) arrays",
+    ".png": "hand-eye takes poses: detect the target first, or give a calibration recording",
+    ".jpg": "hand-eye takes poses: detect the target first, or give a calibration recording",
+}
 
 
-@dataclass(frozen=True)
-class Readings:
-    """Poses as a file may mean them."""
-
-    #: What the quaternions are taken for -> (N, 4, 4), metres. One entry where the file leaves nothing open
-    poses: Mapping[str, Float64]
-    seconds: Float64 | None = None  #: (N,)
-    millimetres: bool = False  #: Whether lengths were millimetres
-
-    def __len__(self) -> int:
-        return len(self.usual)
-
-    @property
-    def usual(self) -> Float64:
-        """(N, 4, 4) of the usual reading."""
-        return next(iter(self.poses.values()))
-
-
-def read_pairs(path: Path) -> tuple[Float64, Float64, dict[str, str]]:
-    """Read pairs of poses of hand and target from one file.
-
-    Returns hand and target, (N, 4, 4) float64, metres, not yet checked to be rigid, and what had to be found out: the order of
-    quaternions, millimetres.
+def read_pairs(path: Path) -> tuple[Readings, Readings]:
+    """Read pairs of poses of hand and target from one file, in all their readings.
 
     :class:`DataError` or :class:`FormatError` for no such file, or another layout.
     """
-    return most_consistent(*_two(path, _content(path)))
+    hand, target = _two(path, _content(path))
+    _as_many(hand, target, path)
+    return hand, target
+
+
+def _as_many(hand: Sized, target: Sized, path: Path) -> None:
+    if len(hand) != len(target):
+        raise DataError(
+            f"{path}: expected as many target poses as hand poses, got {len(target)} and {len(hand)}"
+        )
 
 
 def read_poses(path: Path) -> Readings:
@@ -94,14 +100,15 @@ def read_poses(path: Path) -> Readings:
         return readings_of(list(content), str(path))
     held = _lower(content)
     seconds, poses = _first(held, SECONDS), _first(held, LISTS)
-    if poses is None:
+    sides = {} if poses is not None else _sides(held, str(path))
+    if poses is None and len(sides) != 1:
         raise FormatError(f"{path}: expected poses under one of {', '.join(LISTS)}, got {', '.join(held)}")
-    found = readings_of(list(poses), str(path))
-    return found if seconds is None else replace(found, seconds=np.asarray(seconds, float))
+    found = readings_of(list(poses), str(path)) if poses is not None else next(iter(sides.values()))
+    return found if seconds is None else replace(found, seconds=np.asarray(seconds, float).ravel())
 
 
 def readings_of(values: Sequence[Any], where: str) -> Readings:
-    """Read a list of poses: nested 4x4 or 3x4, flat 16, 12 or 7 numbers, or dictionaries of a translation and a rotation.
+    """Read a list of poses: nested 4x4 or 3x4, flat 16, 12, 7 or 6 numbers, or dictionaries of a translation and a rotation.
 
     :class:`DataError` or :class:`FormatError` names the first pose that is none.
     """
@@ -112,38 +119,6 @@ def readings_of(values: Sequence[Any], where: str) -> Readings:
     if len(orders) > 1 or len(widths) > 1:
         raise FormatError(f"{where}: expected poses of one form, got rows of {sorted(widths)} numbers")
     return _of_rows(np.array([row for _, row in rows]), where, orders.pop())
-
-
-def most_consistent(hand: Readings, target: Readings) -> tuple[Float64, Float64, dict[str, str]]:
-    """Choose the readings of quaternions under which hand and target move rigidly together.
-
-    Returns hand and target, (N, 4, 4), metres, and in words what was decided or converted; empty where files were in metres and the
-    usual order.
-    """
-    both = list(product(hand.poses, target.poses))
-    names = both[0]
-    if len(both) > 1 and len(hand) >= 3:
-        likely = {n: _agreement(hand.poses[n[0]], target.poses[n[1]]) for n in both}
-        best = max(likely, key=lambda n: likely[n])
-        names = best if likely[best] > likely[names] + CLEARER * len(hand) else names
-    said = {}
-    for who, readings, name in (("hand", hand, names[0]), ("target", target, names[1])):
-        words = [f"quaternions {name}"] if len(readings.poses) > 1 and name != USUAL else []
-        words += ["millimetres"] if readings.millimetres else []
-        if words:
-            said[who] = ", ".join(words)
-    return hand.poses[names[0]], target.poses[names[1]], said
-
-
-def _agreement(hand: Float64, target: Float64) -> float:
-    """Log-likelihood of the better mount and sense of the target; -inf where no solution exists."""
-    found = [-np.inf]
-    for A, B in product((hand, invert_all(hand)), (target, invert_all(target))):
-        try:
-            found.append(refined_from_consensus(A, B).log_likelihood)
-        except (DataError, np.linalg.LinAlgError, ValueError):
-            continue
-    return float(max(found))
 
 
 def _lower(held: Mapping[Any, Any]) -> dict[str, Any]:
@@ -161,11 +136,11 @@ def _two(path: Path, content: Any) -> tuple[Readings, Readings]:
         held = _lower(content)
         if (inner := _first(held, LISTS)) is not None:
             return _two(path, inner)
+        sides = _sides(held, str(path))
+        if len(sides) == 2:
+            return sides["hand"], sides["target"]
         hands, targets = _hand_and_target(held, path, "pairs")
-        if len(hands) != len(targets):
-            raise DataError(
-                f"{path}: expected as many target poses as hand poses, got {len(targets)} and {len(hands)}"
-            )
+        _as_many(hands, targets, path)
     elif not isinstance(content, list):
         got = type(content).__name__
         raise FormatError(f"{path}: expected a list of pairs [hand 4x4, target 4x4], got {got}")
@@ -189,18 +164,86 @@ def _hand_and_target(held: Mapping[str, Any], where: object, what: str) -> tuple
     if hand is None or target is None:
         raise FormatError(
             f"{where}: expected {what} under names such as hand and target, got {', '.join(held) or 'nothing'}",
-            hint="known names: " + ", ".join((*HAND[:-1], *TARGET[:-1])),
+            hint="known names: "
+            + ", ".join((*HAND[:-1], *TARGET[:-1]))
+            + ", R_gripper2base with t_gripper2base",
         )
     return hand, target
 
 
+def _sides(held: Mapping[str, Any], where: str) -> dict[str, Readings]:
+    """Sides whose names tell two frames: ``R_gripper2base`` with ``t_gripper2base``, numbered or whole; ``rvecs`` with ``tvecs``."""
+    parts: dict[tuple[str, bool], dict[str, list[Any]]] = {}
+    for key, value in held.items():
+        if (found := _frames(re.sub(r"[_\s]*\d+$", "", key))) is not None:
+            kind, side, inverted = found
+            parts.setdefault((side, inverted), {}).setdefault(kind, []).append(value)
+    out = {}
+    for (side, inverted), part in parts.items():
+        if "r" in part and "t" in part:
+            found_side = _of_parts(part["r"], part["t"], f"{where}: {side}")
+        elif "" in part:
+            values = part[""][0] if len(part[""]) == 1 else part[""]
+            found_side = readings_of(_poses_of(values), f"{where}: {side}")
+        else:
+            continue
+        out[side] = replace(found_side, inverted=inverted)
+    return out
+
+
+def _frames(key: str) -> tuple[str, str, bool] | None:
+    """Kind (``r``, ``t`` or empty for whole poses), side, and whether it is the inverse, of a name such as ``R_gripper2base``."""
+    if key in {"rvecs", "tvecs", "rvec", "tvec"}:
+        return key[0], "target", False
+    kind, rest = "", key
+    if prefix := re.match(r"(r|rot\w*?|rvecs?|t|trans|translations?|tvecs?|h|pose|transform)[_ ]+(?=.)", key):
+        rest = key[prefix.end() :]
+        kind = {"r": "r", "t": "t"}.get(prefix[1][0], "") if not prefix[1].startswith("transform") else ""
+    between = re.fullmatch(r"(\w+?)_?(?:2|to|in|wrt)_?(\w+?)(?:_?(?:list|all|poses|s))?", rest)
+    pair = (between[1], between[2]) if between else tuple(reversed(rest.split("_", 1)))
+    if len(pair) != 2:
+        return None
+    is_frame = [{f for f, words in FRAMES.items() if re.fullmatch(words, word)} for word in pair]
+    if not between:
+        kind = ""  # T_base_flange is a whole pose
+    for side, inner, outer in (("hand", "hand", "base"), ("target", "target", "camera")):
+        if inner in is_frame[0] and (outer in is_frame[1] or (side == "hand" and pair[1] == "world")):
+            return kind, side, False
+        if inner in is_frame[1] and (outer in is_frame[0] or (side == "hand" and pair[0] == "world")):
+            return kind, side, True
+    return None
+
+
+def _poses_of(values: Any) -> list[Any]:
+    array = _array(values, "poses", "file")
+    return list(array.reshape(-1, 4, 4)) if array.ndim == 2 and array.shape[1] == 4 else list(array)
+
+
+def _of_parts(rotations: list[Any], translations: list[Any], where: str) -> Readings:
+    """Read rotations and translations that are kept apart: lists, stacks, columns of (3, 1), matrices of rows."""
+    R, t = (_array(v[0] if len(v) == 1 else v, "numbers", where).squeeze() for v in (rotations, translations))
+    t = t.reshape(1, 3) if t.size == 3 else t
+    if t.ndim != 2 or 3 not in t.shape:
+        raise FormatError(f"{where}: expected translations (N, 3) or (N, 3, 1), got {t.shape}")
+    t = t if t.shape[1] == 3 else t.T
+    n = len(t)
+    if R.size == 9 * n:
+        return _of_rows(np.c_[R.reshape(n, 9), t], where)
+    if R.size not in {3 * n, 4 * n}:
+        raise DataError(f"{where}: expected as many rotations as the {n} translations, got {R.shape}")
+    turn = R if R.shape == (n, R.size // n) else R.T
+    return _of_rows(np.c_[t, turn], where)
+
+
 def _two_of_table(path: Path, text: str) -> tuple[Readings, Readings]:
-    table, _ = _table(text, str(path))
+    table, names = _table(text, str(path))
     width = table.shape[1]
-    half = {14: 7, 15: 7, 24: 12, 25: 12, 32: 16, 33: 16}.get(width)  # odd: a time or a number before them
-    if half is None:
+    half = {12: 6, 13: 6, 14: 7, 15: 7, 24: 12, 25: 12, 32: 16, 33: 16}.get(
+        width
+    )  # odd: a time or a number before
+    if half is None or {"x", "y", "z"} <= set(names):
         raise FormatError(
-            f"{path}: expected JSON, YAML, NPZ, or lines of two poses (14, 24 or 32 numbers), got {width} columns",
+            f"{path}: expected JSON, YAML, NPZ, or lines of two poses (12, 14, 24 or 32 numbers), got {width} columns",
             hint="one pose a line is a stream: give two files, hand and target",
         )
     hand, target = table[:, width - 2 * half : width - half], table[:, width - half :]
@@ -208,92 +251,131 @@ def _two_of_table(path: Path, text: str) -> tuple[Readings, Readings]:
 
 
 def _flat(value: Any, where: str) -> tuple[str, list[float]]:
-    """Row of numbers of one pose, and its quaternion's order where a dictionary told it."""
+    """Row of numbers of one pose, and what a dictionary told of its rotation: the name of its usual reading."""
     if not isinstance(value, Mapping):
         return "", _array(value, "a pose in numbers", where).ravel().tolist()
     known = _lower(value)
-    if (inner := _first(known, WRAPPED)) is not None:
+    if (inner := _first(known, WRAPPED)) is not None and not isinstance(inner, str):
         return _flat(inner, where)
+    if {"rows", "cols", "data"} <= known.keys():
+        return "", _array(value, "a matrix", where).ravel().tolist()
+    named = {ALIASES.get(k, k): v for k, v in known.items()}
+    header = next((h for h in HEADERS if {"x", "y", "z", *h} <= named.keys()), None)
+    if header is not None:
+        return HEADERS[header], _array(
+            [named[k] for k in ("x", "y", "z", *header)], "numbers", where
+        ).tolist()
     move, turn = _first(known, TRANSLATION), _first(known, ROTATION)
     if move is None or turn is None:
         got = ", ".join(known) or "nothing"
         raise FormatError(f"{where}: expected a translation and a rotation, got {got}")
-    xyz, rest = _array(move, "x, y, z", where), _array(turn, "a rotation: x, y, z, w", where)
-    order = USUAL if isinstance(turn, Mapping) else ""
-    return order, (np.c_[rest, xyz] if rest.shape == (3, 3) else np.r_[xyz, rest]).ravel().tolist()
+    xyz, rest = _array(move, "x, y, z", where).ravel(), _array(turn, "a rotation: x, y, z, w", where)
+    order = "xyzw" if isinstance(turn, Mapping) and rest.size == 4 else ""
+    return order, (np.r_[rest.ravel(), xyz] if rest.size == 9 else np.r_[xyz, rest.ravel()]).tolist()
 
 
 def _array(value: Any, what: str, where: str) -> Float64:
-    """Numbers, or those of a dictionary of x, y, z and maybe w."""
+    """Numbers, those of OpenCV's matrices, or those of a dictionary of x, y, z and maybe w."""
+
+    def plain(v: Any) -> Any:
+        if isinstance(v, Mapping):
+            if {"rows", "cols", "data"} <= v.keys():
+                return np.reshape(np.asarray(v["data"], float), (int(v["rows"]), -1)).tolist()
+            return [v[n] for n in ("xyzw" if "w" in v else "xyz")]
+        return [plain(one) for one in v] if isinstance(v, list | tuple) else v
+
     try:
-        row = [value[n] for n in ("xyzw" if "w" in value else "xyz")] if isinstance(value, Mapping) else value
-        return np.asarray(row, dtype=np.float64)
+        return np.asarray(plain(value), dtype=np.float64)
     except (KeyError, ValueError, TypeError) as err:
         raise FormatError(f"{where}: expected {what}, got {str(value)[:60]!r}") from err
 
 
-def _of_rows(rows: Float64, where: str, order: str = "") -> Readings:
-    """Read rows of 7, 12 or 16 numbers; ``order`` of the quaternion where it is known."""
+def _of_rows(rows: Float64, where: str, usual: str = "", unit: str = "", angles: str = "") -> Readings:
+    """Read rows of 6, 7, 12 or 16 numbers; ``usual`` names their rotation's reading where a header or a dictionary told it."""
     if not np.isfinite(rows).all():
         bad = int(np.argmax(~np.isfinite(rows).all(axis=1)))
         raise DataError(f"{where}: expected finite numbers, got NaN or infinity in pose {bad}")
     width = rows.shape[1]
     if width in {12, 16}:
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        poses[:, : width // 4] = rows.reshape(len(rows), width // 4, 4)
-        return _in_metres({"matrix": poses})
+        return _of_matrices(rows, unit)
+    xyz, turn = rows[:, :3], rows[:, 3:]
+    if width == 6:
+        names = angle_names(turn, usual or "rotvec")
+        names = tuple(n for n in names if n.endswith(angles)) or names
+        return Readings(xyz, turn, names, unit=unit, told=bool(usual))
     if width != 7:
-        hint = "rotation vectors and roll, pitch, yaw need a header line that says which: x,y,z,rx,ry,rz or x,y,z,roll,pitch,yaw"
         raise FormatError(
-            f"{where}: expected 7 numbers (translation, quaternion), 12 or 16 (matrix by rows) per pose, got {width}",
-            hint=hint if width == 6 else "see docs/calibrate.md",
+            f"{where}: expected 6 numbers (translation, angles), 7 (translation, quaternion), 12 or 16 (matrix by rows) per pose, got {width}",
+            hint="see docs/calibrate.md",
         )
-    off = np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1)
+    if not usual and _unit(rows[:, :4]) and not _unit(turn):
+        return Readings(rows[:, 4:], rows[:, :4], ("wxyz", "xyzw"), unit=unit, notes=("quaternion first",))
+    off = np.abs(np.linalg.norm(turn, axis=1) - 1)
     if off.max() > UNIT_LENGTH:
         bad = int(np.argmax(off))
         raise DataError(
-            f"{where}: expected unit quaternions, got length {np.linalg.norm(rows[bad, 3:]):.3f} in pose {bad}",
+            f"{where}: expected unit quaternions, got length {np.linalg.norm(turn[bad]):.3f} in pose {bad}",
             hint="the columns must be x,y,z,qx,qy,qz,qw, with a time before them or not; a header line may say otherwise",
         )
-    last = {USUAL: rows[:, 3:], "wxyz": np.roll(rows[:, 3:], -1, axis=1)}  # the scalar
-    orders = (order,) if order else tuple(last)
-    return _in_metres({o: _transforms(rows[:, :3], "quaternion", last[o]) for o in orders})
+    return Readings(xyz, turn, (usual,) if usual else ("xyzw", "wxyz"), unit=unit)
 
 
-def _transforms(xyz: Float64, kind: str, turn: Float64) -> Float64:
-    from scipy.spatial.transform import Rotation
+def _unit(turn: Float64) -> bool:
+    return bool(np.abs(np.linalg.norm(turn, axis=1) - 1).max() <= UNIT_LENGTH)
 
-    if kind == "quaternion":
-        R = Rotation.from_quat(turn)
+
+def _of_matrices(rows: Float64, unit: str) -> Readings:
+    """Read matrices (N, 12) or (N, 16) by rows, by columns, or with the rotation before or after the translation."""
+    n, width = rows.shape
+    if width == 16:
+        forms = {
+            "": (rows.reshape(n, 4, 4), False),
+            "by columns": (rows.reshape(n, 4, 4).swapaxes(1, 2), False),
+        }
+        at = {k: (T[:, :3, :3], T[:, :3, 3], T[:, 3]) for k, (T, _) in forms.items()}
+        name = "" if np.abs(at[""][2] - [0, 0, 0, 1]).max() <= 1e-6 else "by columns"
+        if np.abs(at[name][2] - [0, 0, 0, 1]).max() > 1e-6:
+            name = ""
+            _last_row(at[name][2])
+        R, t, _ = at[name]
     else:
-        # No angle in radians is as large as that: they are degrees.
-        turn = np.radians(turn) if np.abs(turn).max() > 2 * np.pi + 0.01 else turn
-        # ROS: roll, pitch and yaw are about fixed axes.
-        R = Rotation.from_rotvec(turn) if kind == "vector" else Rotation.from_euler("xyz", turn)
-    poses = np.tile(np.eye(4), (len(xyz), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = R.as_matrix(), xyz
-    return poses
+        by = rows.reshape(n, 3, 4)
+        columns = rows.reshape(n, 4, 3).swapaxes(1, 2)
+        layouts = {
+            "": (by[:, :, :3], by[:, :, 3]),
+            "rotation, then translation": (rows[:, :9].reshape(n, 3, 3), rows[:, 9:]),
+            "by columns": (columns[:, :, :3], columns[:, :, 3]),
+            "translation, then rotation": (rows[:, 3:].reshape(n, 3, 3), rows[:, :3]),
+        }
+        fits = [
+            k for k, (R, _) in layouts.items() if np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max() < ORTHOGONAL
+        ]
+        name = fits[0] if fits else ""
+        R, t = layouts[name]
+    return Readings(
+        t, R, ("matrix",), unit=unit, notes=("matrices by columns",) if name == "by columns" else ()
+    )
 
 
-def _in_metres(poses: Mapping[str, Float64]) -> Readings:
-    far = max(float(np.median(np.linalg.norm(p[:, :3, 3], axis=1))) for p in poses.values())
-    if far <= FARTHEST:
-        return Readings(poses)
-    for p in poses.values():
-        p[:, :3, 3] *= 1e-3
-    return Readings(poses, millimetres=True)
+def _last_row(last: Float64) -> None:
+    bad = int(np.argmax(np.abs(last - [0, 0, 0, 1]).max(axis=1) > 1e-6))
+    raise DataError(
+        f"expected rigid transforms, got a last row {last[bad].tolist()} in pose {bad}",
+        "the matrix may hold a scale, or not be a pose",
+    )
 
 
 def _table(text: str, where: str) -> tuple[Float64, list[str]]:
-    """Lines of numbers (N, C), and the columns' names where a header has them; TUM trajectories are such."""
+    """Lines of numbers (N, C), and the columns' names where a header has them; columns of words are left out."""
     names: list[str] = []
     rows: list[list[float]] = []
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line, fields in _fields(text):
         comment = line.lstrip().startswith("#")
-        fields = [f for f in re.split(r"[,;\s]+", line.strip().strip("#").strip()) if f]
         values = _numbers(fields)
         if not fields or (comment and (rows or not _columns(fields))):
             continue
+        if values is None and (labelled := _labelled(line)):
+            names, values = [k for k, _ in labelled], [v for _, v in labelled]
         if values is None and not rows:
             names = _columns(fields) or names
             continue
@@ -303,63 +385,175 @@ def _table(text: str, where: str) -> tuple[Float64, list[str]]:
         rows.append(values)
     if not rows:
         raise DataError(f"{where}: expected poses, one a line, got none")
-    return np.array(rows), names
+    table = np.array(rows)
+    if table.shape[1] == 4 and len(table) % 4 == 0 and np.all(table[3::4] == [0, 0, 0, 1]):
+        return table.reshape(-1, 16), []  # a matrix every four lines
+    return table, names
+
+
+def _fields(text: str) -> Iterator[tuple[int, str, list[str]]]:
+    """Lines that are not empty with their fields; brackets of arrays fall away, decimal commas become points."""
+    lines = text.splitlines()
+    sample = "\n".join(lines[:50])
+    separator = next(
+        (s for s in ";\t" if sample.count(s) >= 2), "," if re.search(r",\s|,-?\d+\.|[a-z],", sample) else None
+    )
+    if separator is None and not re.search(r"\d,\d+[ ]+-?\d+,\d", sample):
+        separator = ","
+    for number, line in enumerate(lines, 1):
+        bare = re.sub(r"^\s*p?[\[({]+|[\])}]+\s*,?\s*$", "", line.strip()).lstrip("#").strip()
+        if separator is None or (separator == "," and "," not in bare):
+            fields = bare.split()
+        else:
+            fields = [
+                f.strip()
+                for f in next(csv.reader(io.StringIO(bare), delimiter=separator, skipinitialspace=True), [])
+            ]
+        if separator != "," or '"' in bare:
+            fields = [re.sub(r"^(-?\d+),(\d+(?:[eE][-+]?\d+)?)$", r"\1.\2", f) for f in fields]
+        while fields and not fields[-1]:
+            fields.pop()
+        if fields:
+            yield number, line, fields
+
+
+def _labelled(line: str) -> list[tuple[str, float]]:
+    """Pairs of name and number of KUKA's ``{X 10.0, Y 5.0, Z 0, A 90, B 0, C 180}``; empty where it is none."""
+    found = re.findall(r"\b([A-Za-z]\w*)\s*[:= ]\s*(-?\d[\d.]*(?:[eE][-+]?\d+)?)", line)
+    pairs = [(ALIASES.get(k.lower(), k.lower()), float(v)) for k, v in found]
+    return pairs if {"x", "y", "z"} <= {k for k, _ in pairs} else []
 
 
 def _numbers(fields: Sequence[str]) -> list[float] | None:
+    """Numbers of a line, NaN for a word or two among more of them; None where it holds none."""
+    words = [
+        bool(re.search(r"[A-DF-Za-df-z_/]", f)) and f.lower().strip("+-") not in {"nan", "inf"}
+        for f in fields
+    ]
+    if not fields or sum(words) > min(2, (len(fields) - 1) / 2):
+        return None
     try:
-        return [float(f) for f in fields]
+        return [np.nan if word else float(f or "nan") for f, word in zip(fields, words, strict=True)]
     except ValueError:
         return None
 
 
 def _columns(fields: Sequence[str]) -> list[str]:
     """Column names of a header line; empty when it is none."""
-    cleaned = [re.sub(r"\(.*?\)|\[.*?\]|['\"]", "", f).strip().lower().split(".")[-1] for f in fields]
-    found = [ALIASES.get(f, f) for f in cleaned if f]
-    return found if {"x", "y", "z"} <= set(found) else []
+    found = [_column(f) for f in fields]
+    return found if {"x", "y", "z"} <= {f.split(" ")[0] for f in found} else []
+
+
+def _column(field: str) -> str:
+    """Name of a column, with its unit after it: ``x mm``, ``roll deg``."""
+    whole = re.sub(r"['\"%]", "", field).strip().lower()
+    unit = re.search(r"[(\[_ ](mm|cm|m|in|deg|rad|degrees|radians|ns|us|ms|s)[)\]]?$", whole)
+    name = re.sub(r"\(.*?\)|\[.*?\]", "", whole).strip() if not unit else whole[: unit.start()].strip(" _")
+    last = name.split(".")[-1].split("/")[-1]
+    if re.search(r"orientation|rotation|quat", name) and last in {"x", "y", "z", "w"}:
+        last = f"q{last}"
+    return f"{ALIASES.get(last, last)} {unit[1][:3]}" if unit else ALIASES.get(last, last)
 
 
 def _by_columns(table: Float64, names: list[str], where: str) -> Readings:
     if not names or len(names) != table.shape[1]:
-        timed = table.shape[1] in {8, 13, 17}
+        width = table.shape[1]
+        timed = width in {8, 13, 17} or (
+            width == 7 and not _unit(table[:, 3:]) and bool((np.diff(table[:, 0]) > 0).all())
+        )
+        timed &= not (width == 7 and _unit(table[:, :4]))
         found = _of_rows(table[:, 1:] if timed else table, where)
         return replace(found, seconds=table[:, 0] if timed else None)
-    at = {n: i for i, n in enumerate(names)}
-    header, kind = next(((h, k) for h, k in HEADERS.items() if set(h) <= at.keys()), ((), ""))
-    if not kind:
+    units = {n.split(" ")[0]: n.split(" ")[1] for n in names if " " in n}
+    at = {
+        n.split(" ")[0]: i for i, n in enumerate(names)
+    }  # of two times the last: a header's stamp, not when it arrived
+    if "qx" in at and "w" in at:
+        at.setdefault("qw", at["w"])
+    header = next((h for h in HEADERS if set(h) <= at.keys()), None)
+    if header is None:
         raise FormatError(
             f"{where}: the header names no rotation: {', '.join(names)}",
-            hint="expected qx,qy,qz,qw, or rx,ry,rz (rotation vector), or roll,pitch,yaw beside x,y,z",
+            hint="expected qx,qy,qz,qw, or rx,ry,rz (rotation vector), or roll,pitch,yaw, or a,b,c (KUKA) beside x,y,z",
         )
-    xyz, turn = (table[:, [at[c] for c in part]] for part in (("x", "y", "z"), header))
-    if kind == "quaternion":
-        found = _of_rows(np.c_[xyz, turn], where, USUAL)
-    elif np.isfinite(table).all():
-        found = _in_metres({kind: _transforms(xyz, kind, turn)})
-    else:
-        raise DataError(f"{where}: expected finite numbers, got NaN or infinity")
-    return replace(found, seconds=table[:, at["t"]] if "t" in at else None)
+    rows = table[:, [at[c] for c in ("x", "y", "z", *header)]]
+    length, angles = units.get("x", ""), units.get(header[0], "")
+    found = _of_rows(rows, where, HEADERS[header], length if length in UNITS else "", angles)
+    seconds = table[:, at["t"]] if "t" in at else None
+    if "secs" in at and "nsecs" in at:
+        seconds = table[:, at["secs"]] + 1e-9 * table[:, at["nsecs"]]
+    return replace(found, seconds=seconds)
 
 
 def _content(path: Path) -> Any:
     """Tell what a file holds: lists and dictionaries, or the text of a table."""
     suffix = path.suffix.lower()
+    if suffix in REMEDIES and path.exists():
+        raise FormatError(
+            f"{path}: expected poses as text, JSON, YAML, XML, NPZ or MAT, got {suffix}", REMEDIES[suffix]
+        )
     try:
         if suffix in {".npz", ".npy"}:
             held = np.load(path, allow_pickle=False)
             return held.tolist() if isinstance(held, np.ndarray) else {k: held[k].tolist() for k in held}
-        text = path.read_text(encoding="utf-8-sig")
-        if suffix in {".yaml", ".yml"}:
-            return _yaml(text, path)
-        return json.loads(text) if suffix == ".json" else text
+        if suffix == ".mat":
+            from scipy.io import loadmat
+
+            return {k: v.tolist() for k, v in loadmat(path).items() if not k.startswith("__")}
+        return _of_text(_decoded(path.read_bytes()), suffix, path)
     except FileNotFoundError as err:
         raise DataError(f"{path}: no such file") from err
-    except (ValueError, OSError, EOFError, BadZipFile) as err:
-        kind = {".npz": "arrays of numbers", ".npy": "an array of numbers", ".json": "JSON"}.get(
-            suffix, "text"
-        )
-        raise FormatError(f"{path}: expected {kind}, got {err or type(err).__name__}") from err
+    except (ValueError, OSError, EOFError, BadZipFile, NotImplementedError, ET.ParseError) as err:
+        kinds = {".npz": "arrays of numbers", ".npy": "an array of numbers", ".json": "JSON", ".xml": "XML"}
+        remedy = "arrays of (3, 1) or (N, 4, 4) numbers, no objects: np.savez(name, hand=np.array(hands, float), ...)"
+        raise FormatError(
+            f"{path}: expected {kinds.get(suffix, 'text')}, got {err or type(err).__name__}",
+            remedy if suffix in {".npz", ".npy"} else "save as MATLAB 5 (-v7)" if suffix == ".mat" else "",
+        ) from err
+
+
+def _decoded(data: bytes) -> str:
+    """Text in UTF-8 or, as Windows' tools write it, in UTF-16 with or without a mark."""
+    if data[:2] in {b"\xff\xfe", b"\xfe\xff"}:
+        return data.decode("utf-16")
+    if data[1:2] == b"\0" and len(data) > 2:
+        return data.decode("utf-16-le")
+    return data.decode("utf-8-sig")
+
+
+def _of_text(text: str, suffix: str, path: Path) -> Any:
+    begins = text.lstrip()[:5]
+    if suffix == ".json":
+        return json.loads(text)
+    if begins[:1] in {"[", "{"} and suffix not in {".yaml", ".yml"}:
+        try:
+            return json.loads(text)
+        except ValueError:
+            return text  # arrays line by line, or KUKA's braces
+    if begins.startswith("<"):
+        if "<!ENTITY" in text:
+            raise FormatError(f"{path}: expected OpenCV's XML, got entities")
+        return _xml(ET.fromstring(text))  # noqa: S314  without entities nothing grows
+    if (
+        suffix in {".yaml", ".yml"}
+        or begins == "%YAML"
+        or re.match(r"(header|pose|transform\w*):\s", text.lstrip())
+    ):
+        return _yaml(text, path)
+    return text
+
+
+def _xml(node: ET.Element) -> Any:
+    """Dictionaries, lists and matrices of OpenCV's XML."""
+    if node.get("type_id") == "opencv-matrix":
+        held = {child.tag: (child.text or "").split() for child in node}
+        return {"rows": held["rows"][0], "cols": held["cols"][0], "data": held["data"]}
+    if not len(node):
+        return (node.text or "").split()
+    tags = [child.tag for child in node]
+    if tags[0] == "_":
+        return [_xml(child) for child in node]
+    return {child.tag: _xml(child) for child in node}
 
 
 def _yaml(text: str, path: Path) -> Any:
@@ -369,7 +563,16 @@ def _yaml(text: str, path: Path) -> Any:
         raise ConfigError(
             f"{path}: reading YAML needs PyYAML", hint="pip install pyyaml, or convert to JSON"
         ) from err
+
+    class Loader(yaml.SafeLoader):
+        """Knows the tag of OpenCV's matrices."""
+
+    Loader.add_constructor(
+        "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
+    )
     try:
-        return yaml.safe_load(text)
+        documents = list(yaml.load_all(re.sub(r"^%YAML.*\n", "", text.lstrip()), Loader))
     except yaml.YAMLError as err:
         raise FormatError(f"{path}: expected YAML, got {str(err)[:200]}") from err
+    documents = [d for d in documents if d is not None]
+    return documents[0] if len(documents) == 1 else documents

@@ -10,7 +10,7 @@ of the camera. One view's stereo frame serves as the target: what the scene is d
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.hand_eye.checks import Cause, HandEyeRefused, clean, thinned
+from calibration.hand_eye.clocks import LEAST, read_clock
 from calibration.hand_eye.closed_form import invert_all
-from calibration.hand_eye.refine import refined_from_consensus
+from calibration.hand_eye.readings import Meant, Readings, choose
+from calibration.hand_eye.refine import refine, refined_from_consensus
 from calibration.registration.clouds import Cloud, stereo_cloud
 from calibration.registration.gate import FINE, Refusal, check_registration, register
 from calibration.registration.pairs import calibration_views
@@ -36,6 +38,7 @@ RIVAL = 0.9  # a second peak this high makes the offset ambiguous
 NEIGHBOURHOOD = 1.0  # s around the peak in which no rival is sought
 GAP = 0.25  # s; poses farther apart are not interpolated
 PAIRS = 200  # pairs kept of a stream: neighbours share their errors and add nothing
+FINEST = 2e-5  # s to which the offset is searched
 SEARCH = 0.15  # s on either side of the correlation's offset in which the likelihood is searched
 SURFACE_POINTS = 40_000  # of the moving cloud; the fixed one stays dense
 STAGES = (0.040, *FINE)  # m; arm poses and the rig's last calibration start it within centimetres
@@ -47,19 +50,69 @@ class Stream:
 
     seconds: Float64  #: (N,) ascending
     poses: Float64  #: (N, 4, 4)
+    said: tuple[str, ...] = ()  #: How the stamps were read, and what was left out
 
 
-def make_stream(seconds: ArrayLike, poses: ArrayLike, name: str) -> Stream:
-    """Check and sort a stream; :class:`DataError` for bad times, poses that are not rigid, fewer than ten poses."""
-    t, T = np.asarray(seconds, dtype=np.float64), clean(poses, name)
-    if t.shape != (len(T),) or not np.isfinite(t).all():
-        raise DataError(f"{name}: expected one finite time per pose, got {t.shape} for {len(T)} poses")
-    order = np.argsort(t, kind="stable")
-    t, T = t[order], T[order]
-    once = np.concatenate([[True], np.diff(t) > 0])
-    if once.sum() < 10:
-        raise DataError(f"{name}: expected at least 10 poses of distinct times, got {int(once.sum())}")
-    return Stream(t[once], T[once])
+def make_stream(stamps: ArrayLike, poses: ArrayLike, name: str) -> Stream:
+    """Check a stream and bring its clock in order; :class:`DataError` for bad times, poses that are not rigid, fewer than ten poses."""
+    t, T = np.asarray(stamps, dtype=np.float64), clean(poses, name)
+    if t.shape != (len(T),):
+        raise DataError(f"{name}: expected one time per pose, got {t.shape} for {len(T)} poses")
+    clock = read_clock(t, T[:, :3, :3], name)
+    return Stream(clock.seconds, T[clock.kept], clock.said)
+
+
+def decided(
+    hand: Readings, target: Readings, offset: float | None = None
+) -> tuple[Float64, Float64, dict[str, Any]]:
+    """Take the readings under which two streams move together, and pair them as :func:`stream_pairs` does.
+
+    Rotation speed hardly depends on how rotations are written, so the clocks are brought together before the readings are ranked.
+    """
+    assert hand.seconds is not None
+    assert target.seconds is not None
+    one, two = _alike(hand, target) if offset is None else (hand.names[0], target.names[0])
+    clocks = [
+        read_clock(side.seconds, side.rotations(name), f"{who} poses")  # type: ignore[arg-type]
+        for who, side, name in (("hand", hand, one), ("target", target, two))
+    ]
+    moving, seen = (
+        Stream(c.seconds, side.take(c.kept).poses(name, "m"), c.said)
+        for c, side, name in zip(clocks, (hand, target), (one, two), strict=True)
+    )
+    start = _coarse_offset(moving, seen)[0] if offset is None else offset
+    after = np.clip(np.searchsorted(moving.seconds, seen.seconds + start), 1, len(moving.seconds) - 1)
+    later = moving.seconds[after] - (seen.seconds + start)
+    nearest = np.where(later < np.diff(moving.seconds)[after - 1] / 2, after, after - 1)
+    close = np.flatnonzero(np.abs(moving.seconds[nearest] - seen.seconds - start) < GAP)
+    few = close[thinned(len(close), PAIRS)] if len(close) else close
+    meant = (
+        choose(hand.take(clocks[0].kept[nearest[few]]), target.take(clocks[1].kept[few]))
+        if len(few) >= LEAST
+        else Meant(one, two, ("m", "m"), {}, ())
+    )
+    moving = replace(moving, poses=hand.take(clocks[0].kept).poses(meant.hand, meant.units[0]))
+    seen = replace(seen, poses=target.take(clocks[1].kept).poses(meant.target, meant.units[1]))
+    A, B, found = stream_pairs(moving, seen, offset)
+    return A, B, {**found, **meant.report()}
+
+
+def _alike(hand: Readings, target: Readings) -> tuple[str, str]:
+    """Readings under which the rotation speeds correlate best; quaternions turn equally fast in either order."""
+    best = hand.names[0], target.names[0]
+    if max(len(hand.names), len(target.names)) <= 2:
+        return best
+    scores = {}
+    for names in dict.fromkeys(
+        [best, *((n, best[1]) for n in hand.names[:6]), *((best[0], n) for n in target.names[:6])]
+    ):
+        moving, seen = (
+            make_stream(side.seconds, side.poses(n, "m"), "poses")  # type: ignore[arg-type]
+            for side, n in zip((hand, target), names, strict=True)
+        )
+        correlation = _correlation(_rotation_speed(moving)[1], _rotation_speed(seen)[1])[1]
+        scores[names] = float(np.nanmax(correlation, initial=-1.0))
+    return max(scores, key=lambda n: scores[n])
 
 
 def stream_pairs(
@@ -74,14 +127,15 @@ def stream_pairs(
 
     :class:`HandEyeRefused` for no correlation, two offsets that fit alike (periodic motion), or streams that do not overlap.
     """
+    clocks = {"clocks": {"hand": list(hand.said), "target": list(target.said)}}
     if offset is not None:
-        return *_pairs_at(hand, target, offset), {"time_offset_s": offset}
+        return *_pairs_at(hand, target, offset), {"time_offset_s": offset, **clocks}
     start, correlation = _coarse_offset(hand, target)
     A, B = _pairs_at(hand, target, start)
     # The mount and the sense of the target may be wrong here; the gate says so once the clocks are right.
     inverted = _log_likelihood(invert_all(A), B) > _log_likelihood(A, B)
     offset, sigma = _refined_offset(hand, target, start, inverted=inverted)
-    found = {"time_offset_s": offset, "time_offset_sigma_s": sigma, "correlation": correlation}
+    found = {"time_offset_s": offset, "time_offset_sigma_s": sigma, "correlation": correlation, **clocks}
     return *_pairs_at(hand, target, offset), found
 
 
@@ -180,16 +234,27 @@ def _refined_offset(
     chosen = np.flatnonzero(inside)
     few = chosen[thinned(len(chosen), PAIRS // 2)]
 
-    def cost(offset: float) -> float:
-        A = _at_times(hand, t[few] + offset)[0]
-        return -_log_likelihood(invert_all(A) if inverted else A, target.poses[few])
+    def turned(late: float) -> Float64:
+        A = _at_times(hand, t[few] + (start + late))[0]
+        return invert_all(A) if inverted else A
 
+    # One start for all trials: a new consensus each time would make the likelihood jump.
+    seen = target.poses[few]
+    first = refined_from_consensus(turned(0.0), seen)
+
+    def cost(late: float) -> float:
+        return -refine(turned(late), seen, first.X, first.Z, first.noise).log_likelihood
+
+    # Searched about zero: the minimiser's tolerance is relative, and clocks may be an epoch apart.
+    trials = np.linspace(-SEARCH, SEARCH, 11)
+    near = trials[int(np.argmin([cost(late) for late in trials]))]
+    width = trials[1] - trials[0]
     found = minimize_scalar(
-        cost, bounds=(start - SEARCH, start + SEARCH), method="bounded", options={"xatol": 3e-4}
+        cost, bounds=(near - width, near + width), method="bounded", options={"xatol": FINEST}
     )
     h = 0.01
     curvature = (cost(found.x - h) - 2 * found.fun + cost(found.x + h)) / h**2
-    return float(found.x), float(1 / np.sqrt(curvature)) if curvature > 0 else None
+    return start + float(found.x), float(1 / np.sqrt(curvature)) if curvature > 0 else None
 
 
 @dataclass(frozen=True)
