@@ -11,8 +11,10 @@ import pytest
 from tests import PATIENCE
 from tofcapture.cli import doctor, main, probe
 from tofcapture.cli.probe import Finding
-from tofcapture.devices import TofCamera
+from tofcapture.devices import Arm, TofCamera, registry
+from tofcapture.devices.kinematics import MODELS
 from tofcapture.errors import DeviceError
+from tofcapture.frames import ArmInfo
 
 PLAN = '[operator]\ndriver = "sim"\n[plan]\ntable = -0.5\ntarget = [0.7, 0, -0.4]\nboard = [0.7, 0, -0.2]\nboard_normal = [0, 0, 1]\n'
 
@@ -230,3 +232,57 @@ def test_folder_of_the_daemon(monkeypatch, tmp_path):
     assert "chmod 700" in next(doctor.check_daemon()).advice
     monkeypatch.setenv("TOFCAPTURE_STATE", str(tmp_path / ("x" * 120)))
     assert "TOFCAPTURE_STATE" in next(doctor.check_daemon()).advice
+
+
+class _Acme(Arm):
+    """Somebody's arm, whose driver forgot what it is like."""
+
+    def __init__(self, table, context):
+        del table, context
+
+    def describe(self):
+        return ArmInfo("acme 6", "1")
+
+    def cautions(self):
+        return ["its brakes are not tested"]
+
+
+class _Entry:
+    name, value = "acme", "acme:DRIVERS"
+
+    def load(self):
+        return {"arm": _Acme}
+
+
+def test_what_an_own_arm_lacks_is_said(tmp_path, monkeypatch):
+    """Unknown kinematics, a home that is not clear and switched-off checks are found before anything opens; a table mends it."""
+    found_by = registry.entry_points
+    monkeypatch.setattr(registry, "entry_points", lambda group: [*found_by(group=group), _Entry()])
+    devices = '[arm]\ndriver = "acme"\n{more}[tof]\ndriver = "sim"\n[stereo]\ndriver = "sim"\n'
+    rows = MODELS["ur5e"].closed
+    dh = [[0, rows.d[0], 90, 0], [rows.a[0], 0, 0, 0], [rows.a[1], 0, 0, 0], [0, rows.d[1], 90, 0]]
+    dh += [[0, rows.d[2], -90, 0], [0, rows.d[3], 0, 0]]
+    table = f"[arm.kinematics]\ndh = {dh}\nradius = 0.05\n"
+    for more, plan, verdict, words in (
+        ("", PLAN, "FAIL", "nobody knows its kinematics"),
+        (table, PLAN, "PASS", "home is clear"),
+        (table, PLAN + "home = [3.1, 0.9, 0.9, -1.7, -1.5, 0.0]\n", "FAIL", "home is not clear: table"),
+        ("[arm.kinematics]\ndh = [[1, 2, 3]]\n", PLAN, "FAIL", "arm.kinematics"),
+    ):
+        found = _station(tmp_path, devices.format(more=more) + plan)
+        (finding,) = [f for f in found if f.what == "arm kinematics"]
+        assert finding.verdict == verdict
+        assert words in finding.found
+        assert finding.advice or verdict == "PASS"
+        assert [f.found for f in found if f.what == "arm caution"] == ["its brakes are not tested"]
+
+
+def test_taking_control_is_said_first(tmp_path, capsys, monkeypatch):
+    """``--open`` says that it takes control of the arm before it does anything."""
+    said = []
+    monkeypatch.setattr(doctor, "probe", lambda *_: said.append(capsys.readouterr().err) or [])
+    file = tmp_path / "lab.toml"
+    file.write_text(PLAN)
+    main(["doctor", "--station", str(file), "--open", "--folder", str(tmp_path)])
+    assert "takes control of" in said[0]
+    assert "lab.toml" in said[0]

@@ -168,7 +168,7 @@ def test_a_controller_that_denies_every_pose_is_no_check(emulator, tmp_path, cap
 def test_a_default_plan_is_driven_to_its_end(tmp_path, model, seed):
     """A planned calibration, its dry run's motions, home and back, on the emulated controller of either arm."""
     with Emulator(model=model) as emulator:
-        file = station_file(tmp_path, emulator, f'model = "{model}"')
+        file = station_file(tmp_path, emulator, f'model = "{model}"\nwatchdog_hz = 1.0')
         emulator.order("haste", factor=10.0)
         with open_station(file, seed, allow_motion=True) as station:
             plan = plan_scene(station, "calibration", 5)

@@ -180,8 +180,7 @@ def probe_station(path: str, opening: str = "") -> Iterator[Finding]:
     context = StationContext(config=config, folder=(file or Path()).resolve().parent)
     found = [finding for role in ROLES for finding in _probe_device(role, context)]
     found += _probe_rig(context)
-    if not any(f.what == "arm" and f.verdict == "FAIL" for f in found):
-        found += _probe_arm(context, workcell)
+    found += _probe_arm(context, workcell)
     yield from found
 
     def open_all() -> str:
@@ -229,7 +228,10 @@ def _probe_arm(context: Any, workcell: Any) -> Iterator[Finding]:
     from tofcapture.devices.registry import arm_kinematics, make_device
     from tofcapture.rig import load_rig
 
-    arm = make_device("arm", context)
+    try:
+        arm = make_device("arm", context)
+    except TofError:
+        return  # that has been said
     for caution in arm.cautions():
         yield graded("arm caution", caution, "take the setting out, unless this arm cannot do otherwise")
 

@@ -183,7 +183,7 @@ class StationArm:
     def _insist(self, moves: set[object]) -> None:
         """Tell the driver to stop until these moves are over."""
         while moves & self._moves:
-            with contextlib.suppress(DeviceError):
+            with contextlib.suppress(Exception):  # whatever it raises: it is told again
                 self._arm.interrupt()
                 self._arm.stop()
             threading.Event().wait(0.02)

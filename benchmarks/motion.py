@@ -1,0 +1,88 @@
+"""Stops around the start of a move at every layer, and default plans driven to their end, on the emulated UR controller.
+
+    python -m benchmarks.motion stops [--layers host,daemon --step 5]
+    python -m benchmarks.motion plans [--seeds 20 --models ur10e,ur5e]
+
+Nothing but the emulator on loopback is moved. Plans are driven at ten times the arm's speed; every motion goes through the
+driver's own checks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from tests.emulated import station_file
+from tests.stopping import LAYERS, faults_of, sweep
+from tests.ur_emulator.process import Emulator
+from tofcapture.devices.station import open_station
+from tofcapture.record.plan import plan_scene, prove
+
+_PLANS = (("calibration", 12), ("calibration", 25), ("mug", 25))
+
+
+def stops(layers: list[str], step: int, folder: Path) -> Iterator[str]:
+    """One row a layer: stops, the longest time to rest and the largest turn after one, and how many were late or unsaid."""
+    yield "| layer | stops | rest after, s: median | longest | turned, deg: most | late or unsaid |\n|---|---|---|---|---|---|"
+    with Emulator() as emulator:
+        for layer in layers:
+            every = max(step, 25) if layer == "daemon" else step
+            emulator.calm()
+            delays = [ms / 1e3 for ms in range(-50, 101, every)]
+            trials = sweep(layer, emulator.host, station_file(folder, emulator), delays)
+            rest, turned = ([t[key] for t in trials] for key in ("rest_s", "turned_deg"))
+            bad = len(faults_of(trials))
+            yield f"| {layer} | {len(trials)} | {np.median(rest):.3f} | {max(rest):.3f} | {max(turned):.2f} | {bad} |"
+
+
+def plans(models: list[str], seeds: int, folder: Path) -> Iterator[str]:
+    """One row a model and kind of plan: how many are complete, motions driven, views by way of home, the farthest turn."""
+    yield "| arm | plan | complete | motions | by way of home | largest turn, deg |\n|---|---|---|---|---|---|"
+    for model in models:
+        with Emulator(model=model) as emulator:
+            emulator.order("haste", factor=10.0)
+            file = station_file(folder, emulator, f'model = "{model}"\nwatchdog_hz = 1.0')
+            for scene, views in _PLANS:
+                done, motions, homes, turn = 0, 0, 0, 0.0
+                for seed in range(seeds):
+                    with open_station(file, seed, allow_motion=True) as station:
+                        plan = plan_scene(station, scene, views)
+                        here = station.arm.state().joints
+                        ways = prove(station, plan)
+                        for goal in [q for way in ways for q in way]:
+                            station.arm.move_to(goal)
+                            turn, here = max(turn, float(np.degrees(np.abs(goal - here).max()))), goal
+                        done += len(plan.views) == views
+                        motions += sum(map(len, ways))
+                        homes += sum(len(way) > 1 for way in ways)
+                yield f"| {model} | {scene}, {views} views | {done} of {seeds} | {motions} | {homes} | {turn:.1f} |"
+
+
+def main() -> None:
+    """Print one of the tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=["stops", "plans"])
+    parser.add_argument("--layers", default=",".join(LAYERS))
+    parser.add_argument("--step", type=int, default=5, help="ms between stops (daemon: 25 at least)")
+    parser.add_argument("--models", default="ur10e,ur5e")
+    parser.add_argument("--seeds", type=int, default=20)
+    args, start = parser.parse_args(), time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        if args.what == "stops":
+            rows = stops(args.layers.split(","), args.step, Path(folder))
+        else:
+            rows = plans(args.models.split(","), args.seeds, Path(folder))
+        for row in rows:
+            print(row, flush=True)
+    print(f"{time.monotonic() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main()
