@@ -34,7 +34,7 @@ def stops(layers: list[str], step: int, folder: Path) -> Iterator[str]:
             every = max(step, 25) if layer == "daemon" else step
             emulator.calm()
             delays = [ms / 1e3 for ms in range(-50, 101, every)]
-            trials = sweep(layer, emulator.host, station_file(folder, emulator), delays)
+            trials = sweep(layer, emulator.host, station_file(folder, emulator, "watchdog_hz = 1.0"), delays)
             rest, turned = ([t[key] for t in trials] for key in ("rest_s", "turned_deg"))
             bad = len(faults_of(trials))
             yield f"| {layer} | {len(trials)} | {np.median(rest):.3f} | {max(rest):.3f} | {max(turned):.2f} | {bad} |"

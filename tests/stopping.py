@@ -213,9 +213,9 @@ def _over_api(host: str, state: Path, scene: str, delay: float) -> dict[str, Any
         assert time.monotonic() < end, "the daemon did not start"
         time.sleep(0.05)
     after = ask("GET", "/v1/state", state=state)["last_event"]
-    job = {"scene": scene, "recording": scene, "views": 1, "frames": 1}
+    job = {"scene": scene, "recording": scene, "views": 1, "frames": 1, "clear": True}
     number = ask("POST", "/v1/jobs", job, state)["id"]
-    ask("POST", "/v1/resume", {}, state)
+    ask("POST", "/v1/resume", {"clear": True}, state)
     with socket.socket(socket.AF_UNIX) as link:
         link.settimeout(PATIENCE)
         link.connect(str(state / "daemon.sock"))

@@ -12,7 +12,6 @@ from tofcapture.devices.kinematics import (
     arm_model,
     dh_model,
     forward,
-    inverse,
     inverse_all,
     link_frames,
     wrap,
@@ -24,6 +23,14 @@ from tofcapture.devices.urdf import urdf_model
 from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.frames import ArmInfo
 from tofcapture.poses import check_transform, rotation_angle, rotation_exp, transform
+
+
+def inverse(model, T_base_flange):
+    """All different solutions (S, 6) of one pose."""
+    q = inverse_all(model, T_base_flange)
+    q = q[np.isfinite(q).all(axis=-1)]
+    return q[np.sort(np.unique(np.round(q, 9), axis=0, return_index=True)[1])]
+
 
 ARMS = sorted(MODELS)
 JOINTS = st.lists(st.floats(-np.pi, np.pi), min_size=6, max_size=6).map(np.array)

@@ -229,12 +229,11 @@ def _check_moves(arm: Any, home: Float64, goal: Float64) -> None:
 def _kinematics(arm: Any) -> ArmModel:
     clause = "kinematics() gives the arm's geometry before opening (dh_model, urdf_model), or the station has [arm.kinematics]"
     try:
-        model = arm.kinematics()
+        model: ArmModel = arm.kinematics()
     except TofError as err:
         raise ContractError(f"{clause}; it raised {err.message}") from err
     _require(isinstance(model, ArmModel), clause, model)
-    checked: ArmModel = model
-    return checked
+    return model
 
 
 def _check_stop(arm: Any, goal: Float64, home: Float64) -> None:

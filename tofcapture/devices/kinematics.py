@@ -338,11 +338,3 @@ def _inverses(T: Float64) -> Float64:
     out[..., :3, 3] = -(rotation @ T[..., :3, 3:])[..., 0]
     out[..., 3, 3] = 1.0
     return out
-
-
-def inverse(model: ArmModel, T_base_flange: ArrayLike) -> Float64:
-    """All joint angles (S, 6) that put the flange at one pose (4, 4); S = 0 when it cannot be reached."""
-    q = inverse_all(model, T_base_flange)
-    q = q[np.isfinite(q).all(axis=-1)]
-    _, first = np.unique(np.round(q, 9), axis=0, return_index=True)
-    return q[np.sort(first)]

@@ -26,7 +26,7 @@ from tofcapture.devices.ur_rtde.limits import (
 )
 from tofcapture.devices.ur_rtde.link import Link, Sample
 from tofcapture.devices.ur_rtde.probe import Controller, probe
-from tofcapture.errors import ConfigError, MotionRefused, MotionStopped
+from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.frames import ArmInfo, ArmState
 from tofcapture.poses import Float64, invert, rotation_exp, transform
 
@@ -154,12 +154,11 @@ class UrArm(Arm):
         goal = self._checked(start, joints)
         self._moving = True
         try:
-            self._latch.check(token)
             self._goal = goal
             if np.abs(goal - start.joints).max() > ARRIVED:
                 self._go(link, start, goal, token)
             return self._state(settle(link, self._settings.settle, lambda: self._latch.check(token)))
-        except (ArmFault, MotionStopped):
+        except BaseException:
             self._halt(link)
             raise
         finally:
@@ -248,7 +247,11 @@ class UrArm(Arm):
     def _within(self, joints: Float64) -> bool:
         if self._settings.controller_limits == "ignore":
             return True
-        return bool(self._opened().command("isJointsWithinSafetyLimits", 3.0, joints.tolist()))
+        link = self._opened()
+        within = bool(link.command("isJointsWithinSafetyLimits", 3.0, joints.tolist()))
+        if not within and (fault := link.trouble()) is not None:
+            raise fault  # it is not the goal that stands against it
+        return within
 
     def _checked(self, start: Sample, joints: Float64) -> Float64:
         if not self._context.allow_motion:
@@ -258,14 +261,17 @@ class UrArm(Arm):
             )
         goal = check_joints(self._settings.model, joints)
         # As a dry run checked it: from where the arm was sent, if it stands there.
-        there = self._goal is not None and np.abs(self._goal - start.joints).max() < 2 * ARRIVED
-        self.check_move(self._goal if there and self._goal is not None else start.joints, goal)
+        here = start.joints
+        if self._goal is not None and np.abs(self._goal - here).max() < 2 * ARRIVED:
+            here = self._goal
+        self.check_move(here, goal)
         return goal
 
     def _go(self, link: Link, start: Sample, goal: Float64, token: object) -> None:
         settings, workcell = self._settings, workcell_of(self._context.config)
         assert self._rig is not None
         speed = joint_speed(settings, self._rig, workcell, start.joints, goal)
+        self._latch.check(token)
         if not link.command("moveJ", 5.0, goal.tolist(), speed, settings.acceleration, True):
             raise link.reason("moveJ")
         seconds = duration(goal - start.joints, speed, settings.acceleration)
