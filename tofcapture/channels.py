@@ -20,7 +20,9 @@ SPEED_OF_LIGHT = 299_792_458.0  # m/s, exact
 
 #: Standard deviations of noise between two wrap vectors, at 1 rad of noise in every phase, below which they pass for one.
 TOLD_APART = 0.5
+BARELY_APART = 0.1  # the same, within a reach that somebody states: bright surfaces only are told apart
 _MOST_WRAPS = 200  # of the highest frequency; as far as anybody looks who does not say how far
+_SAME = 0.02  # as TOLD_APART counts; closer vectors are the same for everybody
 _NOISE = 0.25  # wraps that noise may carry a range across a wrap's end
 
 
@@ -102,9 +104,10 @@ def check_channels(
         raise DataError(
             f"{where}: expected a reach of two ranges in metres, ascending from 0, got {list(reach)}"
         )
-    if high - low > unambiguous(hz) * (1 + 1e-9):
+    most = unambiguous(hz, BARELY_APART)
+    if high - low > most * (1 + 1e-9):
         raise DataError(
-            f"{where}: {', '.join(f'{f / 1e6:g}' for f in hz)} MHz tell ranges apart over {unambiguous(hz):.3f} m only, "
+            f"{where}: {', '.join(f'{f / 1e6:g}' for f in hz)} MHz tell ranges apart over {most:.3f} m only, "
             f"and the reach is {low:g} to {high:g} m",
             hint="state a shorter reach, or record with one more frequency",
         )
@@ -132,19 +135,26 @@ def channels_in_words(modulation_hz: Sequence[float], phase_rad: Sequence[float]
     return ", then ".join(f"{hz / 1e6:g} MHz at {', '.join(phases)} deg" for hz, phases in runs)
 
 
-def unambiguous(hz: Sequence[float]) -> float:
+def unambiguous(hz: Sequence[float], apart: float = TOLD_APART) -> float:
     """Compute the range over which distinct frequencies (F,), Hz, tell all ranges apart, metres.
 
     It is the least common multiple of their ambiguities where ratios are whole numbers. Where they are not, it is the range at
-    which two wrap vectors are closer than :data:`TOLD_APART`: 20.0 and 99.9 MHz are good for 7.50 m.
+    which two wrap vectors are less than ``apart``, less some noise: 20.0 and 99.9 MHz are good for 7.50 m.
     """
+    period, gap = _repeat(hz, apart)
+    return period if gap < _SAME else period - 2 * _NOISE * ambiguity(max(hz))
+
+
+def _repeat(hz: Sequence[float], apart: float) -> tuple[float, float]:
+    """Find the first range at which wraps of all frequencies coincide but for ``apart``, and by how much they do not."""
     U = np.array([ambiguity(f) for f in hz])
     if len(U) == 1:
-        return float(U[0])
+        return float(U[0]), 0.0
     top = np.arange(1, _MOST_WRAPS + 1)[:, None] * U.min()
-    range_, apart = _fitted(np.rint(top / U) * U, U)
-    same = np.flatnonzero(apart < TOLD_APART)
-    return float(range_[same[0]] if len(same) else range_[-1])
+    range_, gap = _fitted(np.rint(top / U) * U, U)
+    same = np.flatnonzero(gap < apart)
+    first = same[0] if len(same) else -1
+    return float(range_[first]), float(gap[first])
 
 
 class WrapTable(NamedTuple):
@@ -171,8 +181,8 @@ def wrap_table(
     spread. Without a reach it is all that the frequencies tell apart.
     """
     U = np.array([ambiguity(f) for f in hz])
-    period = unambiguous(hz)
-    low, high = reach or (0.0, period)
+    low, high = reach or (0.0, unambiguous(hz))
+    period, gap = _repeat(hz, TOLD_APART if high - low <= unambiguous(hz) else BARELY_APART)
     first, last = np.floor(low / U[-1] - _NOISE), np.ceil(high / U[-1] + _NOISE)
     most = round(period / U[-1])  # more look like the first ones
     if last - first > most:
@@ -183,7 +193,7 @@ def wrap_table(
     gaps = _fitted(np.rint(steps / U) * U, U)[1]
     weight = np.asarray(information) / np.square(U)
     noise = _NOISE * U[-1]
-    whole = high - low > period - 2 * noise
+    whole = gap < _SAME and high - low > period - 2 * noise  # what is beyond an end looks like the other end
     bounds = np.array([-np.inf, np.inf]) if whole else np.array([max(low - noise, 0.0), high + noise])
     apart = float(gaps.min(initial=np.inf))
     return WrapTable(

@@ -26,9 +26,10 @@ class Frame(NamedTuple):
         Tensor  #: (B, 1, H, W) range of the lowest minus range of the highest frequency, m: the multipath cue
     )
     cues: Tensor  #: (B, 4, H, W) depth errors that physics expects, m: geometry.multipath
-    modulation: Tensor  #: (B, 2) lowest and highest modulation frequency, Hz
+    #: (B, F) lowest, highest, then other modulation frequencies, Hz; one frequency is there twice
+    modulation: Tensor
     intrinsics: Tensor  #: (B, 4 or 12) of the (H, W) grid, px; see geometry.maps
-    demodulation: Tensor  #: (B, 4, K) weights that turn taps into phasor
+    demodulation: Tensor  #: (B, 2F, K) weights that turn taps into I and Q of each of these frequencies
 
 
 NO_MAPS = frozenset({"modulation", "intrinsics", "demodulation"})

@@ -39,7 +39,7 @@ from tofcapture_model.geometry.multipath import cues
 Float32 = NDArray[np.float32]
 Reader = ShardReader | PackedScene
 MODEST = 1.5e9  # bytes, where the system does not tell what it has
-TABLES = 110  # bytes per pixel of a decoder and its camera's rays, one for each scene
+TABLES = 125  # bytes per pixel of a decoder and its camera's rays, one for each scene
 _MEASURED = 16  # scenes whose first burst the noise is measured on
 
 
@@ -318,9 +318,13 @@ def _expect_alike(readers: Mapping[str, Reader], size: tuple[int, ...]) -> None:
     """Refuse frames that make no batch: other numbers of phases, other sizes unless crops of ``size`` fit into all."""
     kinds: dict[tuple[int, ...], str] = {}
     for name, reader in readers.items():
-        whole = (len(reader.info.modulation_hz), *reader.camera.shape)
+        hz = reader.info.modulation_hz
+        whole = (len(hz), *reader.camera.shape)
         shape = [min(n, s) for n, s in zip(whole[1:], size or whole[1:], strict=True)]
-        kinds.setdefault((whole[0], *shape), f"{name}, {' x '.join(map(str, whole))}")
+        kinds.setdefault(
+            (whole[0], len(set(hz)), *shape),
+            f"{name}, {' x '.join(map(str, whole))} of {len(set(hz))} frequencies",
+        )
     if len(kinds) > 1:
         raise DataError(
             f"expected frames of one kind, got {' and '.join(kinds.values())}",
@@ -339,7 +343,9 @@ def _burst_noise(readers: Mapping[str, Reader], frames: int) -> BurstNoise:
     some = [readers[name] for name in sorted(readers)][:: -(-len(readers) // _MEASURED)]
     bursts = (np.stack([reader.raw(0, f) for f in range(frames)]) for reader in some)
     full_scale = saturations.pop()
-    return BurstNoise(frames, photon_transfer(bursts, full_scale) if frames > 1 else TapNoise(), full_scale)
+    noise = photon_transfer(bursts, full_scale) if frames > 1 else TapNoise()
+    signed = not all(reader.info.offset for reader in readers.values())
+    return BurstNoise(frames, noise, full_scale, -full_scale if signed else 0.0)
 
 
 def spare_memory() -> float:

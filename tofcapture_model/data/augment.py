@@ -5,6 +5,7 @@ Each keeps raw taps, phasors, depth and gap consistent: decoding the changed tap
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -23,6 +24,7 @@ class BurstNoise(NamedTuple):
     averaged: float  #: frames that a given one is the mean of
     noise: TapNoise  #: of one tap of one frame
     full_scale: float  #: raw value of saturation
+    least: float = 0.0  #: smallest raw value; below 0 where taps are signed
 
 
 def redraw_noise(taps: Tensor, generator: torch.Generator, burst: BurstNoise) -> Tensor:
@@ -35,7 +37,7 @@ def redraw_noise(taps: Tensor, generator: torch.Generator, burst: BurstNoise) ->
     variance = taps.clamp(min=0) / burst.noise.electrons_per_unit + burst.noise.read**2
     drawn = torch.randn(taps.shape, generator=generator, device=taps.device)
     lacking = (variance - variance / burst.averaged).clamp(min=0).sqrt()
-    out = (taps + drawn * lacking).round().clamp(0, burst.full_scale)
+    out = (taps + drawn * lacking).round().clamp(burst.least, burst.full_scale)
     return torch.where(taps >= burst.full_scale, burst.full_scale, out)
 
 
@@ -46,11 +48,19 @@ def redraw_frame(frame: Frame, generator: torch.Generator, burst: BurstNoise) ->
     frequency, so calibration and wraps stay. Cues stay, too, as they are smooth. Holes keep their filling.
     """
     raw = redraw_noise(frame.raw * burst.full_scale, generator, burst) / burst.full_scale
-    phasor = torch.einsum("bck,bkhw->bchw", frame.demodulation, raw)
-    low = turn(phasor[:, :2], frame.phasor[:, :2]) * metres_per_radian(frame, 0)
-    high = turn(phasor[:, 2:], frame.phasor[:, 2:]) * metres_per_radian(frame, 1)
-    confidence = phasor[:, 2:].square().sum(1, keepdim=True).sqrt()
-    return _moved(frame, low, high)._replace(raw=raw, phasor=phasor, confidence=confidence)
+    before, after = _phasors(frame, frame.raw), _phasors(frame, raw)
+    moves = [
+        turn(z, was) * metres_per_radian(frame, k)
+        for k, (z, was) in enumerate(zip(after, before, strict=True))
+    ]
+    phasor = torch.cat(after[:2], dim=1)
+    confidence = after[1].square().sum(1, keepdim=True).sqrt()
+    return _moved(frame, moves)._replace(raw=raw, phasor=phasor, confidence=confidence)
+
+
+def _phasors(frame: Frame, raw: Tensor) -> tuple[Tensor, ...]:
+    """Compute the phasors (B, 2, H, W) of taps (B, K, H, W), of each frequency as ``frame.modulation`` has them."""
+    return torch.einsum("bck,bkhw->bchw", frame.demodulation, raw).split(2, dim=1)
 
 
 def redraw_calibration(frame: Frame, generator: torch.Generator, radians: float) -> Frame:
@@ -61,25 +71,30 @@ def redraw_calibration(frame: Frame, generator: torch.Generator, radians: float)
     ``radians`` is the standard deviation of each amplitude; a camera's error varies by ``sqrt(3)`` times this. Depth, gap and the
     gap's cue move; raw, phasors and confidence are what was measured.
     """
-    low, high = (_drawn_error(frame, which, generator) * radians for which in (0, 1))
-    moved = _moved(frame, low, high)
-    cues = torch.cat([frame.cues[:, :-1], frame.cues[:, -1:] + low - high], dim=1)
+    phasors = (frame.phasor[:, :2], frame.phasor[:, 2:], *_phasors(frame, frame.raw)[2:])
+    drawn = [_drawn_error(frame, k, z, generator) * radians for k, z in enumerate(phasors)]
+    one = (frame.modulation[:, 0] == frame.modulation[:, 1]).reshape(-1, 1, 1, 1)
+    drawn[0] = torch.where(one, drawn[1], drawn[0])  # one frequency has one error
+    moved = _moved(frame, drawn)
+    cues = torch.cat([frame.cues[:, :-1], frame.cues[:, -1:] + drawn[0] - drawn[1]], dim=1)
     return moved._replace(cues=cues)
 
 
-def _drawn_error(frame: Frame, which: int, generator: torch.Generator) -> Tensor:
-    """(B, 1, H, W) metres per radian of amplitude, for the low (0) or the high (1) frequency."""
-    in_phase, quadrature = frame.phasor[:, 2 * which : 2 * which + 2].chunk(2, dim=1)
+def _drawn_error(frame: Frame, which: int, phasor: Tensor, generator: torch.Generator) -> Tensor:
+    """(B, 1, H, W) metres per radian of amplitude, for one of the frequencies and its phasor (B, 2, H, W)."""
+    in_phase, quadrature = phasor.chunk(2, dim=1)
     phase = torch.atan2(quadrature, in_phase)
     waves = torch.cat([wave(m * phase) for m in _ORDERS for wave in (torch.cos, torch.sin)], dim=1)
     amplitudes = torch.randn((*waves.shape[:2], 1, 1), generator=generator, device=waves.device)
     return (amplitudes * waves).sum(1, keepdim=True) * metres_per_radian(frame, which)
 
 
-def _moved(frame: Frame, low: Tensor, high: Tensor) -> Frame:
+def _moved(frame: Frame, moves: Sequence[Tensor]) -> Frame:
     """Add (B, 1, H, W) metres to the range of each frequency: depth moves as the decoder fuses them, holes do not."""
     square = frame.modulation.square()
-    lean = (square[:, :1] / square.sum(1, keepdim=True)).reshape(-1, 1, 1, 1)
+    leans = (square / square.sum(1, keepdim=True)).T.reshape(len(moves), -1, 1, 1, 1)
+    fused = sum((lean * move for lean, move in zip(leans, moves, strict=True)), torch.zeros_like(frame.depth))
     length = rays(frame.intrinsics, *frame.depth.shape[-2:]).square().sum(1, keepdim=True).sqrt()
-    depth = frame.depth + frame.valid * (high + lean * (low - high)) / length
-    return frame._replace(depth=depth, gap=frame.gap + low - high)
+    return frame._replace(
+        depth=frame.depth + frame.valid * fused / length, gap=frame.gap + moves[0] - moves[1]
+    )

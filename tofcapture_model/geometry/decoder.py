@@ -202,15 +202,20 @@ class TorchDecoder:
 
 
 def demodulation(info: TofInfo) -> Tensor:
-    """Compute weights (4, K) that turn taps into I and Q of the lowest, then of the highest frequency."""
-    F = len(frequencies(info.modulation_hz))
-    return torch.tensor(tap_rows(info).weights[[0, F, F - 1, 2 * F - 1]], dtype=torch.float32)
+    """Compute weights (2F, K) that turn taps into I and Q of the frequencies of :func:`modulation`."""
+    hz = frequencies(info.modulation_hz)
+    rows = [row for k in _order(len(hz)) for row in (k, len(hz) + k)]
+    return torch.tensor(tap_rows(info).weights[rows], dtype=torch.float32)
 
 
 def modulation(info: TofInfo) -> Tensor:
-    """Return the lowest and the highest modulation frequency (2,), Hz; a camera of one frequency has it twice."""
+    """Return the lowest, the highest and the other modulation frequencies (F,), Hz; a camera of one frequency has it twice."""
     hz = frequencies(info.modulation_hz)
-    return torch.tensor([hz[0], hz[-1]], dtype=torch.float32)
+    return torch.tensor([hz[k] for k in _order(len(hz))], dtype=torch.float32)
+
+
+def _order(count: int) -> list[int]:
+    return [0, count - 1, *range(1, count - 1)]
 
 
 def fill_nearest(image: Tensor, valid: Tensor) -> Tensor:

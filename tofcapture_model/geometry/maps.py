@@ -320,5 +320,5 @@ def turn(new: Tensor, old: Tensor) -> Tensor:
 
 
 def metres_per_radian(frame: Frame, which: int) -> Tensor:
-    """Return (B, 1, 1, 1) range per phase of the low (0) or the high (1) frequency."""
+    """Return (B, 1, 1, 1) range per phase of the lowest (0), the highest (1) or another frequency."""
     return (SPEED_OF_LIGHT / (4 * math.pi)) / frame.modulation[:, which].reshape(-1, 1, 1, 1)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.channels import Reach, ambiguity, frequencies, wrap_table
+from tofcapture.channels import Reach, ambiguity, frequencies, unambiguous, wrap_table
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase.phasors import Complex128, Float64, information, phasors, wrapped_range
 from tofcapture.rig import RangeError, image_places, radius_px
@@ -58,7 +58,7 @@ def decode_phasors(phasor: Complex128, info: TofInfo, celsius: float = float("na
     turn = 2 * np.pi / table.U
     weight = (turn**2 * known)[:, None, None] * np.square(amplitude)
     best, ranges = np.full(amplitude.shape[1:], np.inf), wrapped
-    for n in wrap_vectors(table.U, info.reach or (0.0, table.period)):
+    for n in wrap_vectors(table.U, info.reach or (0.0, unambiguous(hz))):
         candidate = wrapped + (n * table.U)[:, None, None]
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = (weight * candidate).sum(axis=0) / weight.sum(axis=0)

@@ -24,6 +24,7 @@ from tofcapture_model.geometry.maps import (
 
 NORMAL_RADIUS = 4
 NEAREST = 0.05  # m
+_WHOLE = 1e-4  # of a frequency ratio
 _JUMP = 0.05  # m; across a larger step of depth a bilinear mean would be a point in the air
 
 
@@ -67,11 +68,14 @@ def decode(frame: Frame, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     lean = high_metres.square() / (low_metres.square() + high_metres.square())  # f^2: inverse variance
     turned = turn(high, frame.phasor[:, 2:]) * high_metres
     gap = frame.gap + turn(low, frame.phasor[:, :2]) * low_metres - turned
-    wraps = frame.valid * high_range * torch.round(gap / high_range)
+    # in another ratio there is no next wrap at the same gap: the decoder's stay
+    ratio = low_range / high_range
+    whole = (ratio - torch.round(ratio)).abs() < _WHOLE
+    wraps = whole * frame.valid * high_range * torch.round(gap / high_range)
     gap = gap - wraps
     length = rays(frame.intrinsics, *frame.depth.shape[-2:]).square().sum(1, keepdim=True).sqrt()
     # the decoder's ranges lie within that of the low frequency
-    rounds = low_range * torch.floor((frame.depth * length + wraps) / low_range)
+    rounds = whole * low_range * torch.floor((frame.depth * length + wraps) / low_range)
     moved = turned + wraps - frame.valid * rounds + lean * (gap - frame.gap)
     return frame.depth + moved / length, gap
 

@@ -59,7 +59,7 @@ class MRM(Baseline):
         kernels = self.kernels(frame.raw).float()
         with torch.autocast(frame.raw.device.type, enabled=False):
             mixed = torch.einsum("bcihw,bchw->bihw", kernels, frame.raw)
-            low, high = torch.einsum("bpc,bchw->bphw", frame.demodulation, mixed).chunk(2, dim=1)
+            low, high = torch.einsum("bpc,bchw->bphw", frame.demodulation[:, :4], mixed).chunk(2, dim=1)
         return decode(frame, low, high)[0]
 
     def kernels(self, raw: Tensor) -> Tensor:
