@@ -141,7 +141,8 @@ def test_a_device_that_cannot_be_described_is_told_of_once(monkeypatch, tmp_path
         def describe(self):
             raise DeviceError("not opened yet", hint="open it")
 
-    monkeypatch.setattr("tofcapture.devices.registry.make_device", lambda role, _: Shy())
+    make = registry.make_device
+    monkeypatch.setattr(registry, "make_device", lambda role, c: Shy() if role == "tof" else make(role, c))
     text = "".join(f'[{role}]\ndriver = "sim"\n' for role in ("arm", "tof", "stereo"))
     found = [(f.what, f.verdict, f.found, f.advice) for f in _station(tmp_path, text + PLAN)]
     assert [f for f in found if f[0] == "tof"] == [("tof", "WARN", "not opened yet", "open it")]
