@@ -15,7 +15,8 @@ cache size), and says so beside the figure. ``--again FILE`` tries the survivors
 more seconds or after tests were added.
 
 Needs ``coverage`` installed in the interpreter's own site-packages: its start-up hook measures the processes of tests. ``--map``
-keeps what the first run measured. Of a file that changed since, no line is known, and every test of the file is tried.
+keeps what the first run measured, with the text of every file: lines that have moved since are found again, and a new line is taken
+for one with the line above it.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from __future__ import annotations
 import argparse
 import ast
 import difflib
-import hashlib
 import importlib
+import itertools
 import json
 import multiprocessing
 import os
@@ -74,33 +75,26 @@ context = ${PYTEST_CURRENT_TEST-}
 # --- the plugin for pytest: which test runs now, and what came of it ---
 
 
+_SECONDS: defaultdict[str, float] = defaultdict(float)
+_FAILED: set[str] = set()
+
+
+def _measuring() -> Any:
+    import coverage
+
+    return coverage.Coverage.current()
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Any:
     """Note the lines that follow under the test's name."""
-    import coverage
-
-    now = coverage.Coverage.current()
-    if now is not None:
+    if now := _measuring():
         now.switch_context(item.nodeid)
     try:
         return (yield)
     finally:
-        if now is not None:
+        if now:
             now.switch_context("")
-
-
-def pytest_sessionfinish() -> None:
-    """Save the lines of a worker, which ends without leave."""
-    import coverage
-
-    now = coverage.Coverage.current()
-    if now is not None:
-        now.stop()
-        now.save()
-
-
-_SECONDS: defaultdict[str, float] = defaultdict(float)
-_FAILED: set[str] = set()
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
@@ -110,9 +104,12 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
         _FAILED.add(report.nodeid)
 
 
-def pytest_unconfigure(config: pytest.Config) -> None:
-    """Write times and failures where the run was told to."""
-    if not hasattr(config, "workerinput") and "MUTANTS_TIMES" in os.environ:
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Save the lines of a worker, which ends without leave; write times and failures where the run was told to."""
+    if now := _measuring():
+        now.stop()
+        now.save()
+    if not hasattr(session.config, "workerinput") and "MUTANTS_TIMES" in os.environ:
         text = json.dumps({"seconds": _SECONDS, "failed": sorted(_FAILED)})
         Path(os.environ["MUTANTS_TIMES"]).write_text(text, encoding="utf-8")
 
@@ -124,22 +121,16 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 class Map:
     """Which tests execute a line, how long each test takes, which ones fail without any mutant."""
 
-    digests: dict[str, str]  # of the files as they were measured
-    tests: dict[str, dict[int, set[str]]]  # path -> line -> tests; "" where an import executes it
+    sources: dict[str, str]  # the files as they were measured
+    tests: dict[str, dict[str, list[str]]]  # path -> line -> tests; "" where an import executes it
     seconds: dict[str, float]
     failed: list[str]
-
-    def knows(self, path: str) -> bool:
-        """Tell whether a file is as it was: of a changed one no line is known, and every test of it is run."""
-        return self.digests.get(path) == digest(path)
 
     @cached_property
     def files(self) -> dict[str, Counter[str]]:
         """Count, for every file of the packages and every test file, the lines of the one that the other executes."""
         return {
-            path: Counter(
-                file for tests in at.values() for file in {t.partition("::")[0] for t in tests - {""}}
-            )
+            path: Counter(f for t in at.values() for f in {x.partition("::")[0] for x in t if x})
             for path, at in self.tests.items()
         }
 
@@ -148,6 +139,16 @@ class Map:
         """Count all lines that a test file executes."""
         return sum(self.files.values(), Counter())
 
+    def tests_of(self, path: str, line: int) -> set[str] | None:
+        """Find the tests that execute a line of the present file; ``None``: there is none."""
+        before, now = self.sources.get(path, "").splitlines(), _text_of(path).splitlines()
+        blocks = difflib.SequenceMatcher(None, before, now, autojunk=False).get_matching_blocks()
+        at, old, size = max((b.b, b.a, b.size) for b in [difflib.Match(0, 0, 0), *blocks] if b.b < line)
+        known, there = self.tests.get(path, {}), old + min(line - at, size)
+        if line - at > size:  # a new line
+            there = next((n for n in range(there, 0, -1) if str(n) in known), 0)
+        return set(known[str(there)]) if str(there) in known else None
+
     def rounds(self, path: str, line: int, most: float) -> list[list[str]]:
         """Choose what a mutant is tried on: the tests of its line, in two helpings, and then whole files that execute its file.
 
@@ -155,10 +156,9 @@ class Map:
         the share that it has of a test file's lines. The last two helpings take at most ``most`` seconds of tests, as measured.
         """
         near: dict[str, list[str]] = {}
-        tests = self.tests.get(path, {}).get(line, {""}) if self.knows(path) else {""}
+        tests = self.tests_of(path, line) or {""}
         if "" not in tests:
-            tests = tests & self.seconds.keys()
-            for test in sorted(tests, key=lambda t: self.seconds[t]):
+            for test in sorted(tests & self.seconds.keys(), key=lambda t: self.seconds[t]):
                 near.setdefault(test.partition("::")[0], []).append(test)
         about = self.files.get(path, Counter())
         cost = {file: sum(self._took(t) for t in near.get(file, [file])) for file in about}
@@ -174,18 +174,12 @@ class Map:
         return sum(s for t, s in self.seconds.items() if t.startswith(test + "::"))
 
     def _within(self, tests: list[str], most: float) -> list[str]:
-        taken = []
-        for test in tests:
-            most -= self._took(test)
-            if most < 0:
-                break
-            taken.append(test)
-        return taken
+        took = itertools.accumulate(self._took(test) for test in tests)
+        return [test for test, sum_ in zip(tests, took, strict=True) if sum_ <= most]
 
 
-def digest(path: str) -> str:
-    """Return what tells one state of a file from another."""
-    return hashlib.sha256((ROOT / path).read_bytes()).hexdigest()
+def _text_of(path: str) -> str:
+    return (ROOT / path).read_text(encoding="utf-8")
 
 
 def product() -> list[str]:
@@ -225,7 +219,7 @@ def measure(tree: Path, folder: Path, jobs: int) -> dict[str, Any]:
                 of_file.setdefault(line, set()).add(test)
     tests = {path: {str(n): sorted(t) for n, t in at.items()} for path, at in found.items()}
     return {
-        "digests": {p: digest(p) for p in product()},
+        "sources": {p: _text_of(p) for p in product()},
         "tests": tests,
         **json.loads(times.read_text(encoding="utf-8")),
     }
@@ -272,7 +266,7 @@ class Mutant:
 
     def diff(self) -> str:
         """Return the change as a reader wants it."""
-        before = (ROOT / self.path).read_text(encoding="utf-8").splitlines()
+        before = _text_of(self.path).splitlines()
         return "\n".join(
             difflib.unified_diff(before, self.text.splitlines(), self.path, self.kind, lineterm="", n=2)
         )
@@ -346,7 +340,7 @@ def source_after(source: str, node: Any, kind: str) -> str:
 def draw(count: int, seed: int, only: str) -> list[Mutant]:
     """Draw lines evenly over those that can be changed, and one place on each."""
     by_line: dict[tuple[str, int], list[tuple[Any, str]]] = {}
-    sources = {p: (ROOT / p).read_text(encoding="utf-8") for p in product() if p.startswith(only)}
+    sources = {p: _text_of(p) for p in product() if p.startswith(only)}
     for path, source in sources.items():
         for node, kind in places(ast.parse(source)):
             by_line.setdefault((path, node.lineno), []).append((node, kind))
@@ -368,7 +362,7 @@ def draw(count: int, seed: int, only: str) -> list[Mutant]:
 
 def compiled(path: str, line: int) -> bool:
     """Tell whether a line is in a function that numba compiles, where coverage sees nothing."""
-    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    tree = ast.parse(_text_of(path))
     kernels = [f for f in ast.walk(tree) if isinstance(f, ast.FunctionDef)]
     return any(
         f.lineno <= line <= (f.end_lineno or 0)
@@ -379,8 +373,7 @@ def compiled(path: str, line: int) -> bool:
 
 def trial(mutant: Mutant, tree: Path, known: Map, most: float) -> tuple[str, str]:
     """Return ``dies``, ``lives`` or ``unseen`` (no test executes the line), and the test that noticed."""
-    seen = mutant.line in known.tests.get(mutant.path, {}) or not known.knows(mutant.path)
-    if not seen and not compiled(mutant.path, mutant.line):
+    if known.tests_of(mutant.path, mutant.line) is None and not compiled(mutant.path, mutant.line):
         return "unseen", ""
     file, listed = tree / mutant.path, tree / "tests-to-run.txt"
     kept, stamp = file.read_bytes(), file.stat()
@@ -435,12 +428,10 @@ def main() -> None:
     kept = args.map or folder / "map.json"
     if not kept.exists():
         kept.write_text(json.dumps(measure(trees[0], folder, args.jobs)), encoding="utf-8")
-    read = json.loads(kept.read_text(encoding="utf-8"))
-    read["tests"] = {p: {int(n): set(t) for n, t in at.items()} for p, at in read["tests"].items()}
-    known = Map(**read)
+    known = Map(**json.loads(kept.read_text(encoding="utf-8")))
     known.totals  # noqa: B018  counted once, before the workers fork
-    if changed := [p for p in product() if not known.knows(p)]:
-        print(f"Changed since {kept} was measured, every test of theirs is run: {', '.join(changed)}")
+    if new := [p for p in product() if p not in known.sources]:
+        print(f"No test of these is known, measure anew: {', '.join(new)}")
 
     for name in LIBRARIES:
         with suppress(ImportError):

@@ -1,4 +1,4 @@
-"""Numbers and words that commands answer with stay what they were: golden/answers/NAME.json holds them.
+"""Numbers and words that commands and pages answer with stay what they were: golden/answers/NAME.json holds them.
 
 An answer may say more than it did. What it said, it says still: the same words, and the same numbers to a hundredth, for sums and
 iterations round differently on other machines. ``GOLDEN=keep python -m pytest tests/test_x.py`` writes an answer that is meant to
@@ -28,11 +28,19 @@ def hold(name, answer, *, off=1e-2, least=1e-9, without=(), names=()):
         text = text.replace(json.dumps(str(own))[1:-1], word)
     found = _less(json.loads(text), set(without))
     path = KNOWN / f"{name}.json"
+    name = f"GOLDEN=keep if this is meant: {name}"
     if os.environ.get("GOLDEN") == "keep":
         KNOWN.mkdir(exist_ok=True)
         lines = [f"{json.dumps(k)}: {json.dumps(v, sort_keys=True)}" for k, v in sorted(found.items())]
         path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
     _same(json.loads(path.read_text(encoding="utf-8")), found, name, off, least)
+
+
+def of_page(html):
+    """Words of a page as an answer, charts, pictures and digests apart."""
+    text = re.sub(r"<(style|svg)\b.*?</\1>", "", html, flags=re.DOTALL)
+    words = [w.strip() for w in re.split(r"<[^>]*>", text)]
+    return {"words": [re.sub(r"\b[0-9a-f]{10,64}\b", "DIGEST", " ".join(w.split())) for w in words if w]}
 
 
 def _plain(value):

@@ -31,7 +31,7 @@ from calibration.evidence.page import (
     write_evidence_page,
 )
 from calibration.limits import LENS, LIMITS, judged, worst
-from tests import pictures
+from tests import answers, pictures
 from tofcapture.camera import Camera
 from tofcapture.colours import Scale
 from tofcapture.devices.sim.config import read_constants
@@ -139,6 +139,7 @@ def test_page_stands_alone(recording, drawn):
     page = out.read_text()
     assert "<script" not in page
     assert not re.search(r'(?:src|href)="(?!#|data:)', page)
+    answers.hold("evidence-page", answers.of_page(page), off=0.05, least=0.02)
     pictures.hold("evidence", drawn)
     charts_found = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
     assert len(charts_found) >= 8

@@ -137,7 +137,7 @@ def test_broken_stations(tmp_path):
 def test_a_device_that_cannot_be_described_is_told_of_once(monkeypatch, tmp_path):
     """What it is, is not known before it was opened; nothing is said to pass that nobody looked at."""
 
-    class Shy(TofCamera):
+    class Shy(TofCamera, Arm):
         def describe(self):
             raise DeviceError("not opened yet", hint="open it")
 

@@ -17,7 +17,7 @@ pytest.importorskip("matplotlib")
 import h5py
 import torch
 
-from tests import pictures
+from tests import answers, pictures
 from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, FormatError
@@ -227,7 +227,8 @@ def page(parts, charts, tmp_path_factory):
 
 
 def test_page_looks_as_it_did(page, charts):
-    """Charts of rig and loss, and every picture of the sensor and of ground truth."""
+    """Charts of rig and loss, every picture of the sensor and of ground truth, and its words and numbers."""
+    answers.hold("report-page", answers.of_page(page), off=0.02, least=1e-3)
     pictures.hold("report", charts)
     pictures.hold("report-views", pictures.of_page(page))
 
