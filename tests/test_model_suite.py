@@ -89,6 +89,7 @@ def test_a_suite_writes_its_tables_and_every_number(dataset, runs, tmp_path, cap
     answers.hold(
         "evaluate",
         {**results, "methods": untrained},
+        off=0.1,
         least=1e-4,
         without=("spread", "runs", "manifest_sha256"),
         names=[(dataset, "DATASET")],
