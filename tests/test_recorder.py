@@ -391,7 +391,6 @@ def test_command_records_the_simulated_station(tmp_path, capsys):
     assert view.truth is not None
     told = {
         "quality": view.provenance["quality"],
-        "joints": view.arm_before.joints,
         "times": view.tof.time_ns,
     }
     states = [view.arm_before.time_ns, view.arm_after.time_ns, view.stereo.time_ns]
