@@ -117,7 +117,7 @@ def _copies(paths: Iterable[Path]) -> dict[Path, str]:
             same.setdefault(stored_digest(path) or digest_once(path), []).append(path)
         except (OSError, DataError):
             continue  # whoever reads it says why it cannot be read
-    found = {}
+    found: dict[Path, str] = {}
     for alike in (paths for paths in same.values() if len(paths) > 1):
         original = next((p for p in alike if _place_of(p) == (p.parent.name, view_number(p))), alike[0])
         found |= {p: f"a copy of {original.parent.name}/{original.name}" for p in alike if p != original}
