@@ -64,7 +64,7 @@ class Rig:
             "BENCH_FULL": str(self.full),
             "BENCH_FAULT": str(self.fault),
             "BENCH_STATE": str(self.queue_full),
-            "BENCH_LOST": "4",
+            "BENCH_LOST": "6" if self.station == "arrays" else "20",
             "BENCH_DELAY": "0.02",
             "BENCH_HOST": "1",
             "OMP_NUM_THREADS": "1",
