@@ -65,6 +65,7 @@ class Rig:
             "BENCH_FAULT": str(self.fault),
             "BENCH_STATE": str(self.queue_full),
             "BENCH_LOST": "6" if self.station == "arrays" else "20",
+            "BENCH_SCOPE": f"kill-anywhere-{os.getpid()}",  # nobody else's stop is meant for this
             "BENCH_DELAY": "0.02",
             "BENCH_HOST": "1",
             "OMP_NUM_THREADS": "1",

@@ -196,9 +196,18 @@ def _emptied(folder):
     folder.mkdir()
 
 
-@pytest.mark.parametrize("go", [_moved, _emptied, shutil.rmtree], ids=["moved", "unmounted", "deleted"])
-@pytest.mark.parametrize("which", ["disk", "disk/r", "disk/r/views", "disk/r/views/mug"])
-@pytest.mark.parametrize("step", ["moving", "sealing"])
+@pytest.mark.parametrize(
+    ("go", "which", "step"),
+    [
+        (_emptied, "disk", "moving"),
+        (_emptied, "disk", "sealing"),
+        (_moved, "disk/r", "sealing"),
+        (_emptied, "disk/r", "sealing"),
+        (shutil.rmtree, "disk/r", "tof"),
+        (_moved, "disk/r/views", "moving"),
+        (shutil.rmtree, "disk/r/views/mug", "sealing"),
+    ],
+)
 def test_a_folder_that_goes_ends_the_run(tmp_path, go, which, step):
     """Moved, unmounted or deleted while recording: the run ends with the reason, and nothing is written anywhere else."""
 

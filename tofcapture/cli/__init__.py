@@ -161,19 +161,18 @@ class _Terminated(KeyboardInterrupt):
 @contextmanager
 def _terminable() -> Iterator[None]:
     """Let SIGTERM end a command as Ctrl-C does; commands that have their own way, as the daemon, replace it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
     def end(number: int, _: object) -> None:
         signal.signal(number, signal.SIG_IGN)  # the second one must not break into the putting away
         raise _Terminated
 
-    before = signal.signal(signal.SIGTERM, end)
+    ours = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, end) if ours else None
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        if ours:
+            signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -182,10 +181,10 @@ def _notes_on_one_line() -> Iterator[None]:
     usual = warnings.showwarning
 
     def show(message: Any, category: type[Warning], *where: Any, **more: Any) -> None:
-        if issubclass(category, PassedOver):
-            print(f"tofcapture: {message}", file=sys.stderr)
-        else:
+        if not issubclass(category, PassedOver):
             usual(message, category, *where, **more)
+        else:
+            print(f"tofcapture: {message}", file=sys.stderr)
 
     with warnings.catch_warnings():
         warnings.simplefilter("default", PassedOver)

@@ -247,20 +247,8 @@ class Run:
         signal.signal(number, self._usual[number])
 
     def _restore(self) -> None:
-        for number, usual in self._usual.items():
-            signal.signal(number, usual)
-        self._usual = {}
-
-    @property
-    def asked_to_leave(self) -> bool:
-        """Whether somebody wants the run to end, resumable."""
-        return self._asked is not None
-
-    def leave_if_asked(self) -> None:
-        """Do what the signal that came means."""
-        if self._asked is not None:
-            self._restore()
-            signal.raise_signal(self._asked)
+        while self._usual:
+            signal.signal(*self._usual.popitem())
 
     def batches(self, data: FrameDataset, stage: Stage, workers: int) -> Iterator[tuple[Frame, Target]]:
         """Yield the stage's batches, on the device, from where the run is to its end; validates after epochs."""
@@ -305,9 +293,18 @@ class Run:
         self.report(what, *self._told, f"step {position.step} loss {self.losses['total']:.3f}")
 
     def save_now_and_then(self, moments: Moments, *, now: bool = False) -> None:
-        """Write the resume point once a minute, or at once: everything that the next step depends on."""
-        if self.group.rank > 0 or not (now or time.monotonic() - self._saved > SAVE_EVERY):
-            return
+        """Write the resume point once a minute, or at once: everything that the next step depends on.
+
+        A signal that came since the last step has it written too, and then its usual effect.
+        """
+        due = now or self._asked is not None or time.monotonic() - self._saved > SAVE_EVERY
+        if due and self.group.rank == 0:
+            self._save(moments)
+        if self._asked is not None:
+            self._restore()
+            signal.raise_signal(self._asked)
+
+    def _save(self, moments: Moments) -> None:
         tensors = {f"model/{k}": v for k, v in self.model.state_dict().items()}
         tensors |= {f"adam/{name}/{k}": v for name, values in moments.items() for k, v in values.items()}
         state = {"key": self.key, "losses": self.losses, **self.position.__dict__}

@@ -127,10 +127,9 @@ def train(
                     learner.step(rate)
                     run.stepped(stage, loss, rate)
                     stop = stop_after is not None and run.position.step >= stop_after
-                    run.save_now_and_then(learner.moments(), now=stop or run.asked_to_leave)
+                    run.save_now_and_then(learner.moments(), now=stop)
                     if stop:
                         return run.ended()
-                    run.leave_if_asked()
         if group.rank == 0:
             _finish(run, source)
             run.save_now_and_then(learner.moments(), now=True)
