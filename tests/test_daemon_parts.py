@@ -1,5 +1,6 @@
 """Parts of the daemon by themselves: pictures, queue, addresses, what systemd hears, what counts as a full disk."""
 
+import asyncio
 import contextlib
 import errno
 import os
@@ -132,6 +133,21 @@ def test_the_log_is_of_the_last_hours(tmp_path):
             + [("2026-01-02T00:00:00+00:00", "log")] * 501,
         )
     assert [event.id for event in queue.log("2026-01-01T12:00:00+00:00")] == list(range(4, 504))
+    queue.close()
+
+
+def test_a_stream_too_many_is_refused(tmp_path, monkeypatch):
+    """Who asks for events of a daemon that has as many listeners as it bears, or that ends, is told to come back."""
+    pytest.importorskip("aiohttp")
+    queue = store.Store(tmp_path / "q")
+    for most, close in ((0, False), (1, True)):
+        monkeypatch.setattr(store, "MOST_STREAMS", most)
+        streams = store.Streams(queue)
+        if close:
+            streams.close()
+        answer = asyncio.run(streams.serve(None))
+        assert (answer.status, len(streams)) == (503, 0)
+        assert f"at most {most} event streams" in answer.text
     queue.close()
 
 

@@ -73,6 +73,9 @@ def test_mirroring_twice_is_the_identity_and_keeps_the_geometry(dataset, axis):
     frame, target = data[(0, 0)]
     once = mirror(frame, target, axis)
     twice = mirror(*once, axis)
+    assert torch.equal(
+        mirror(frame, target)[0].depth, frame.depth.flip(-1)
+    )  # left and right, where nothing is said
     assert all(torch.allclose(a, b) for a, b in zip(frame, twice[0], strict=True))
     k = scale_intrinsics(once[0].intrinsics[None], 2)
     fitted = depth_to_normals(once[1].depth[None], once[1].good[None].float() + 1e-6, k, radius=1)[0]

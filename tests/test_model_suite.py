@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -153,7 +154,8 @@ def test_a_card_tells_of_its_run(dataset, runs):
     assert "| training.seed | `0` | `1` |" in text
     assert sha256_of(dataset / "manifest.json") in text
     assert "| train | 1 | 2 | 4 |" in text
-    assert f"{provenance['steps']} step" in text
+    assert re.search(rf"\b{provenance['steps']} step{'s' if provenance['steps'] != 1 else ''}\b", text)
+    assert not re.search(r"\b1 (step|view|scene|minute)s\b", text)
     assert f"tofcapture evaluate {dataset} --weights {runs / 'demo-1'}" in text
     assert "val MAE mm" in text
     assert provenance["minutes"] >= 0

@@ -352,6 +352,18 @@ def test_full_disk_and_wrong_arguments_are_refused(tmp_path, monkeypatch):
     assert bench.steps == []
 
 
+def test_room_for_the_views_that_are_left_is_enough(tmp_path, monkeypatch):
+    """A disk that holds the whole recording and no view more fills up while it is made, and nobody complains."""
+
+    def usage(_):
+        taken = len(list(tmp_path.glob("views/*/view-*.h5")))
+        return type("Usage", (), {"free": (VIEWS - taken) * 40e6 + 0.5e9})()
+
+    monkeypatch.setattr(resources.shutil, "disk_usage", usage)
+    _record(tmp_path)
+    assert len(list(tmp_path.glob("views/*/view-*.h5"))) == VIEWS
+
+
 def test_foreign_journal_is_refused(tmp_path):
     """A journal that is no database is named, not overwritten."""
     journal_path(tmp_path).write_bytes(b"not a database" * 100)
