@@ -32,8 +32,9 @@ def dataset(tmp_path_factory):
     return make_dataset(tmp_path_factory.mktemp("data") / "dataset", scale=4)
 
 
-def test_nothing_stays_on_the_host(dataset, tmp_path):
+def test_nothing_stays_on_the_host(tmp_path):
     """Training with validation, evaluation and a suite on a device that refuses to mix its tensors with the host's."""
+    dataset = make_dataset(tmp_path / "data", views=1, frames=1, scale=4)
     done = subprocess.run(
         [sys.executable, "-m", "tests.second_device", str(dataset), str(tmp_path)],
         cwd=ROOT,
