@@ -215,6 +215,10 @@ def test_protective_stop_resume_reorder_retake_connection_lost(tmp_path, page):
         )
         assert len(list(tmp_path.glob("root/r/views/gear/view-*.h5.retaken"))) == 1
         assert page.locator("#views tr", has_text="%").count() == 3  # what was measured of the others stays
+        page.click("[aria-label='Retake view 2']")
+        page.click("#sure-stop")  # also while it asks, stop is one press
+        _says(page, "stopped by the operator")
+        assert len(daemon.ask("GET", "/v1/jobs")["jobs"]) == 5
     _says(page, "connection lost", "the arm may still move", "press the red button on the teach pendant")
     assert _colour(page) == RED
     assert "red button" in page.text_content("#alarm")

@@ -63,7 +63,7 @@ def _run(args: argparse.Namespace) -> Outcome:
     if not here and (handed := _handed_over(args, scene, views)):
         return handed
     with (
-        stoppable(f"{scene} into {args.out}") as stop,
+        stoppable(f"{scene} into {args.out.absolute()}") as stop,
         open_station(station_file, args.seed, allow_motion=args.allow_motion) as station,
     ):
         stop.check()

@@ -108,7 +108,10 @@ def record(
         )
     if retake is not None and retake not in {view.index for view in plan.views}:
         raise JobRefused(f"retake: expected a view from 0 to {len(plan.views) - 1}, got {retake}")
-    with full_disk_named(recording), stoppable(f"{scene} into {recording}", station.arm.stop) as stop:
+    with (
+        full_disk_named(recording),
+        stoppable(f"{scene} into {recording.absolute()}", station.arm.stop) as stop,
+    ):
         scene_folder = view_path(recording, scene, 0).parent
         scene_folder.mkdir(parents=True, exist_ok=True)
         folders = HeldFolders(recording.parent, recording, scene_folder.parent, scene_folder)

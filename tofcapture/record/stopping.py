@@ -27,7 +27,7 @@ from typing import Any
 from tofcapture.record.observer import Stopped
 
 PREFIX = "tofcapture-stop"  # of the sockets' names
-GRACE = 2.0  # s that a process may take to stop its arm, until it is killed
+GRACE = 3.0  # s that a process may take to stop its arm, until it is killed
 _KILLED = 2.0  # s until a killed process is gone
 _ROOT = 0
 _CREDENTIALS = struct.Struct("3i")  # process, user, group; the kernel fills it in
@@ -177,27 +177,38 @@ def _tell(mine: dict[bytes, tuple[_Channel, Told]]) -> None:
     end, unsent, unheard = time.monotonic() + GRACE, set(mine), set(mine)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
         link.bind("")  # the kernel finds a free name for the answers
-        while unheard and time.monotonic() < end:
+        while unheard and (left := end - time.monotonic()) > 0:
             for address in sorted(unsent):
-                try:
-                    link.sendto(b"stop", socket.MSG_DONTWAIT, address)
-                except BlockingIOError:
+                if (gone := _send(link, address)) is None:
                     continue  # its queue is full: again, below
-                except OSError:  # it has just ended
+                unsent.discard(address)
+                if gone:
                     unheard.discard(address)
                     mine[address][1].problem, mine[address][1].how = "", "it has ended"
-                unsent.discard(address)
-            link.settimeout(0.02 if unsent else max(0.001, end - time.monotonic()))
-            try:
+            link.settimeout(min(left, 0.02) if unsent else left)
+            with contextlib.suppress(TimeoutError):
                 text, sender = link.recvfrom(65536)
-            except TimeoutError:
-                continue
-            if sender in mine:
-                answer, one = json.loads(text), mine[sender][1]
-                one.what = answer["what"]
-                if answer["error"] is not None:
-                    one.problem = answer["error"] and f"it could not stop: {answer['error']}"
+                if sender in mine and _heard(json.loads(text), mine[sender][1]):
                     unheard.discard(sender)
+
+
+def _send(link: socket.socket, address: bytes) -> bool | None:
+    """Send the order; true when nobody is there any more, ``None`` when it does not fit in just now."""
+    try:
+        link.sendto(b"stop", socket.MSG_DONTWAIT, address)
+    except BlockingIOError:
+        return None
+    except OSError:
+        return True
+    return False
+
+
+def _heard(answer: dict[str, Any], one: Told) -> bool:
+    """Take in an answer: the first says who it is, the second, for which this is true, what came of the order."""
+    one.what, error = answer["what"], answer["error"]
+    if error is not None:
+        one.problem = error and f"it could not stop: {error}"
+    return error is not None
 
 
 def _kill(channel: _Channel, one: Told) -> None:

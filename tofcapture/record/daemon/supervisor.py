@@ -194,7 +194,7 @@ class Supervisor:
         if self.real and not clear:
             raise UsageError(
                 "a real arm may move: expected clear: true",
-                hint="see that everybody is out of the arm's reach, then say so",
+                hint="see that everybody is out of the arm's reach, then say so; tofcapture record says it by --allow-motion",
             )
 
     def add(self, request: Mapping[str, Any]) -> tuple[Job, bool]:

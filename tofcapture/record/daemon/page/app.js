@@ -113,6 +113,7 @@ function showState() {
   $("confirm").hidden = lost || !asks;
   if (!state) return;
   if (job) set($("job"), `${named(job)}: ${job.state}${job.reason ? ` (${job.reason})` : ""}`);
+  $("job").className = job?.state === "failed" ? "failed" : "";
   set($("motion"), state.simulated ? "Simulated station." : state.allow_motion ? "A real arm may move." : "A real arm may not move.");
   showProgress(progress, doing);
   const { disk_free_bytes: free, recorder, restarts } = state.health;
