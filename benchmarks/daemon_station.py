@@ -120,7 +120,7 @@ class _Arrays:
         )
 
 
-class _Role:
+class _Role(Arm):
     simulated = True
     person = "BENCH_ASKS" in os.environ
     can_turn = False
@@ -249,8 +249,9 @@ class _Followed:
 
     def __init__(self, hosted: Any, arm: Any) -> None:
         self._hosted, self._arm = hosted, arm
-        self.describe, self.state, self.kinematics, self.check_move = (
-            arm.describe, arm.state, arm.kinematics, arm.check_move,
+        self.describe, self.state, self.cautions = arm.describe, arm.state, arm.cautions
+        self.kinematics, self.check_move = (
+            arm.kinematics, arm.check_move,
         )  # fmt: skip
 
     def move_to(self, joints: Any) -> Any:

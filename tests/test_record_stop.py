@@ -25,8 +25,9 @@ pytest.importorskip("aiohttp")
 
 
 @pytest.fixture
-def scope(monkeypatch):
-    """A name of its own: a test must not stop what else records on this machine."""
+def scope(monkeypatch, tmp_path):
+    """A name of its own: a test must not stop what else records on this machine, nor see the arms that others hold."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     name = f"test-{os.getpid()}-{time.monotonic_ns()}"
     monkeypatch.setattr(stopping, "PREFIX", name)
     return name
@@ -70,7 +71,7 @@ def test_a_recorder_without_a_daemon_is_stopped(tmp_path, scope, capsys, monkeyp
     with child(scope, code, stderr=subprocess.PIPE) as recorder:
         until(lambda: list(tmp_path.glob("r/views/mug/view-*.h5")))
         code, said = _stop(capsys, tmp_path / "no-daemon")
-        assert code == 0
+        assert code == 0, said
         assert f"mug into {tmp_path / 'r'} (process {recorder.pid}): stopped" in said
         assert recorder.wait(PATIENCE) == 130
         assert "stopped by the operator" in recorder.stderr.read()
@@ -88,10 +89,10 @@ def test_the_daemon_and_its_recorder_are_stopped(tmp_path, scope, capsys, queue)
         daemon.record(5)
         daemon.wait(lambda s: s["progress"]["sealed"] == 1)
         if queue == "garbage":
-            for path in daemon.state.glob("queue.sqlite*"):
-                path.write_bytes(b"\xff" * 9000)
+            for name in ("queue.sqlite", "queue.sqlite-wal"):  # the third is mapped into the daemon's memory
+                (daemon.state / name).write_bytes(b"\xff" * 9000)
         code, said = _stop(capsys, daemon.state)
-        assert (code, "stop" in log.read_text()) == (0, True)
+        assert (code, "stop" in log.read_text()) == (0, True), said
         assert f"the daemon over {daemon.root}" in said
         assert f"mug into {daemon.root / 'r'} (process " in said
         if queue == "whole":
@@ -123,7 +124,7 @@ def test_what_does_not_answer_is_killed(tmp_path, scope, capsys):
         _channels(1)
         until(lambda: " T " in _stat(frozen.pid))
         code, said = _stop(capsys, tmp_path)
-        assert code == 0
+        assert code == 0, said
         assert f"(process {frozen.pid}): it did not answer; it was killed" in said
         until(lambda: not alive(frozen.pid))
 
@@ -169,9 +170,8 @@ def test_a_daemon_elsewhere_that_does_not_answer_is_said(tmp_path, scope, capsys
         assert "red button" in said
 
 
-def test_an_arm_that_somebody_else_holds_is_said(tmp_path, scope, capsys, monkeypatch):
+def test_an_arm_that_somebody_else_holds_is_said(tmp_path, scope, capsys):
     """A process that holds a real arm and does not listen was not stopped."""
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     code = (
         "import time; from types import SimpleNamespace as N; from tofcapture.record.resources import hold_arm\n"
         "with hold_arm(N(simulated=False, describe=lambda: N(model='ur5e', serial='1'))): print(1, flush=True); time.sleep(999)"
