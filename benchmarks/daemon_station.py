@@ -151,6 +151,9 @@ class _Role(Arm):
     def check_move(self, start: Any, goal: Any) -> None:
         del start, goal
 
+    def cautions(self) -> list[str]:
+        return []
+
     def move_to(self, joints: Any) -> Any:
         self._note("move")
         if Path(os.environ.get("BENCH_PROTECT", "/nowhere")).exists():
