@@ -10,6 +10,11 @@ import pytest
 
 from tests.stations import HALF_SIZE_CAMERAS
 from tofcapture.cli import main
+from tofcapture.devices.registry import StationContext
+from tofcapture.devices.sim.drivers import SimArm, SimTof
+from tofcapture.devices.sim.world import shared_world
+from tofcapture.devices.station import open_station, read_station
+from tofcapture.testing import check_tof
 
 SMALL_CAMERAS = (
     HALF_SIZE_CAMERAS
@@ -97,3 +102,104 @@ def _run_readme_example(shard, capsys):
     )
     exec(compile(code, "README.md", "exec"), {})  # noqa: S102
     assert capsys.readouterr().out.startswith("steps (8, 90, 120)")
+
+
+OTHER_CAMERAS = {
+    # three frequencies of three phases, one of four, I and Q of two: as sold, but for the number of pixels of the last two
+    "adtf3175": (320, 240, 208.5, 3),
+    "arducam-b0410": (160, 120, 127.0, 1),
+    "ti-opt8241": (224, 172, 147.5, 2),
+}
+
+
+def _station(folder, preset):
+    W, H, f, _ = OTHER_CAMERAS[preset]
+    tof = f'preset = "{preset}"\nwidth = {W}\nheight = {H}\nfx = {f}\nfy = {f}\ncx = {(W - 1) / 2}\ncy = {(H - 1) / 2}\n'
+    embedded = files("tofcapture.devices").joinpath("station.toml").read_text(encoding="utf-8")
+    small = SMALL_CAMERAS.split("[sim.tof]")[0] + SMALL_CAMERAS[SMALL_CAMERAS.index("[sim.render]") :]
+    path = folder / "station.toml"
+    path.write_text(f"{embedded.replace('seed = 0', 'seed = 5')}{small}\n[sim.tof]\n{tof}")
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("preset", OTHER_CAMERAS)
+def test_the_whole_way_of_another_camera(preset, tmp_path, capsys):
+    """One, two and three frequencies, three sizes: conformance, record, align, build, check, train, evaluate, predict, export, view, figures."""
+    pytest.importorskip("torch")
+    station = _station(tmp_path, preset)
+    W, H, _, F = OTHER_CAMERAS[preset]
+    with open_station(station) as opened:
+        info = opened.tof.describe()
+    assert (info.camera.width, info.camera.height, len(set(info.modulation_hz))) == (W, H, F)
+    check_tof(_tof_of(station))
+    rec, data, model = tmp_path / "rec", tmp_path / "data", tmp_path / "model"
+    view, weights = rec / "views/steps/view-000.h5", ("--weights", model)
+    record = ("record", "--frames", 3, "--out", rec, "--station", station)
+    lines = {
+        "board": (*record, "--calibration", "--views", 6),
+        "stack": (*record, "--scene", "stack", "--views", 2),
+        "steps": (*record, "--scene", "steps", "--views", 2),
+        "align": ("align", rec, "--method", "joint"),
+        "build": ("build-dataset", rec, "--out", data),
+        "check recording": ("check", rec),
+        "check": ("check", data),
+        "train": ("train", data, "--out", model, "--preset", "demo", "--epochs", 1),
+        "evaluate": ("evaluate", data, *weights, "--out", tmp_path / "results.json"),
+        "predict": ("predict", view, *weights, "--out", tmp_path / "torch"),
+        "export": ("export", *weights, "--size", H, W),
+        "onnx": ("predict", view, *weights, "--out", tmp_path / "onnx", "--backend", "onnx"),
+        "view": ("view", view, "--png", tmp_path / "view.png"),
+        "shard": ("view", data / "shards/steps.h5", "--png", tmp_path / "shard.png"),
+        "evidence": ("view", rec / "evidence.json", "--png", tmp_path / "evidence.png"),
+        **{
+            f: ("export-dataset", data, "--format", f, "--out", tmp_path / f)
+            for f in ("ply", "png16", "mcap")
+        },
+        "report": (
+            "report",
+            "--dataset",
+            data,
+            "--results",
+            tmp_path / "results.json",
+            *weights,
+            "--out",
+            tmp_path / "report.html",
+        ),
+        **{
+            kind: ("figure", kind, source, "--out", tmp_path / f"{kind}.png")
+            for kind, source in (
+                ("acquisition", rec),
+                ("preprocessing", rec),
+                ("depth", data),
+                ("normals", data),
+            )
+        },
+    }
+    answer = {}
+    for name, words in lines.items():
+        code = main([str(w) for w in words] + ["--json"])
+        said = capsys.readouterr().out
+        assert code == 0, (name, said)
+        answer[name] = json.loads(said)
+    assert answer["align"]["rotation_error_deg"] < 0.1
+    assert answer["align"]["translation_error_mm"] < 1
+    assert answer["build"]["gt"]["median_error_mm"] < 0.3
+    assert answer["check"].get("problems", []) == answer["check recording"].get("problems", []) == []
+    depth = json.loads((tmp_path / "results.json").read_text())["methods"]["sensor"]["depth"]["pixel"]
+    assert 0 < depth["mae"] < 0.03
+    ours, theirs = (np.load(next((tmp_path / b).rglob("depth.npy"))) for b in ("torch", "onnx"))
+    assert ours.shape[-2:] == (2 * H, 2 * W)
+    np.testing.assert_allclose(ours, theirs, atol=1e-3)
+    pictures = ("view", "shard", "evidence", "acquisition", "preprocessing", "depth", "normals")
+    assert all((tmp_path / f"{name}.png").stat().st_size > 5000 for name in pictures)
+
+
+def _tof_of(station):
+    """Make the ToF camera of a station again and again, a scene before it."""
+    context = StationContext(read_station(station), station.parent)
+    shared_world(context).place("box")
+    with SimArm({}, context):
+        pass
+    return lambda: SimTof({}, context)

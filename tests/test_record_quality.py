@@ -12,7 +12,7 @@ from tofcapture.devices.console import ConsoleOperator
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.files.view import read_view, view_path
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
-from tofcapture.poses import invert, look_at, rotation_exp, transform
+from tofcapture.poses import invert, look_at, rotation_exp, transform, transform_points
 from tofcapture.record.quality import (
     LIMITS,
     NOTE,
@@ -25,7 +25,7 @@ from tofcapture.record.quality import (
     meter,
     quality_table,
 )
-from tofcapture.rig import Rig
+from tofcapture.rig import SPEED_OF_LIGHT, Rig
 
 __all__ = ["_few_candidates"]  # applies here too
 
@@ -40,7 +40,8 @@ def _good(**change):
     rng = np.random.default_rng(1)
     info = TofInfo("fake", "1", TOF, np.zeros(3))
     phase = np.asarray(info.phase_rad)
-    clean = 600 + 200 * np.cos(1.0 + phase)[:, None, None] * np.ones((8, 36, 48))
+    turn = 4 * np.pi / SPEED_OF_LIGHT * np.array(info.modulation_hz)[:, None, None] * 0.8 * TOF.ray_lengths
+    clean = 600 + 200 * np.cos(turn + phase[:, None, None])
     raw = np.round(clean + rng.normal(0, 4, (FRAMES, *clean.shape))).astype(np.uint16)
     u, v = np.meshgrid(np.arange(64.0), np.arange(52.0))
     points = 0.8 * np.stack([(u - 31.5) / 50, (v - 25.5) / 50, np.ones_like(u)], axis=-1)
@@ -120,6 +121,58 @@ def test_each_check_fires_on_what_it_is_for(name, change):
     failing = _failing({**parts, **change(parts)})
     assert name in failing
     assert failing <= {name, *(("overlap",) if name == "stereo_coverage" else ())}
+
+
+def _slanted(hz=(20e6, 100e6), near=0.5, far=1.5, **stated):
+    """A wall from near to far as channels of ``hz`` see it, described by a driver that may state something else."""
+    parts = _good()
+    u = np.linspace(0, 1, 64)
+    z = np.broadcast_to(near + (far - near) * u, (52, 64))
+    points = STEREO.unproject(z)
+    true = TofInfo(
+        "fake",
+        "1",
+        TOF,
+        np.zeros(3),
+        tuple(np.repeat(hz, 4)),
+        tuple(np.tile(np.arange(4) * np.pi / 2, len(hz))),
+    )
+    seen = transform_points(RIG.T_tof_stereo, points.reshape(-1, 3))
+    at = np.rint(TOF.project(seen)[0]).astype(int)
+    range_ = np.full(TOF.shape, np.nan)
+    good = ((at >= 0) & (at < [48, 36])).all(axis=1)
+    range_[at[good, 1], at[good, 0]] = np.linalg.norm(seen[good], axis=1)
+    range_ = np.where(np.isnan(range_), np.nanmean(range_), range_)
+    phase = (
+        4 * np.pi / SPEED_OF_LIGHT * np.array(true.modulation_hz)[:, None, None] * range_ + 2.0
+    )  # a delay of its own
+    clean = 600 + 200 * np.cos(phase + np.array(true.phase_rad)[:, None, None])
+    raw = np.round(clean + np.random.default_rng(0).normal(0, 4, (FRAMES, *clean.shape))).astype(np.uint16)
+    info = replace(
+        true,
+        **{
+            k: tuple(np.asarray(getattr(true, k))[v]) if isinstance(v, list) else v for k, v in stated.items()
+        },
+    )
+    stereo = replace(parts["stereo"], points=points.astype(np.float32))
+    return {**parts, "stereo": stereo, "tof": replace(parts["tof"], raw=raw, info=info)}
+
+
+@pytest.mark.parametrize("hz", [(20e6, 100e6), (60.24e6, 80.32e6)])
+def test_channels_that_are_not_what_the_driver_states_are_refused(hz):
+    """Frequencies swapped, taps in another order, another sign: each is named at the first view; a sensor's own delay is none of them."""
+    assert _failing(_slanted(hz)) == set()
+    swapped = [4, 5, 6, 7, 0, 1, 2, 3]
+    assert "misread" in _failing(_slanted(hz, modulation_hz=swapped))
+    assert "misread" in _failing(_slanted(hz, phase_rad=[0, 3, 2, 1, 4, 7, 6, 5]))
+    assert "misfit" in _failing(_slanted(hz, phase_rad=[1, 0, 2, 3, 4, 5, 6, 7]))
+
+
+def test_a_scene_out_of_reach_is_refused():
+    """75 MHz repeats after 2 m: a wall from 1.8 to 3 m is told at the first view, one near a stated distance is not."""
+    assert _failing(_slanted((75e6,), 0.4, 1.6)) == set()
+    assert _failing(_slanted((75e6,), 1.8, 3.0)) == {"out_of_reach"}
+    assert _failing(_slanted((75e6,), 1.8, 3.0, reach=(1.5, 3.4))) == set()
 
 
 def test_dark_is_noted_and_unlit_is_refused():

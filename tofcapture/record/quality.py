@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.frames import ArmState, StereoFrame, TofBurst
+from tofcapture.channels import SPEED_OF_LIGHT, frequencies, unambiguous
+from tofcapture.frames import ArmState, StereoFrame, TofBurst, TofInfo
 from tofcapture.meshes import inside
-from tofcapture.ops.phase import mean_phasors
+from tofcapture.ops.phase import Complex128, mean_phasors
 from tofcapture.poses import Float64, invert, rotation_angle, transform, transform_points
 from tofcapture.rig import Rig
 
@@ -36,6 +37,11 @@ _CELLS = (18, 24)  # of the ToF image, in which overlap is counted
 _COLUMNS = 320  # of the stereo grid are enough for that
 _BLOCK = 20  # px; side of the blocks whose means are compared between frames
 _CLOCKS = 50_000_000  # ns; how far a device's idea of the host's clock may be off
+_BRIGHT = 50.0  # raw units; noise plays no part in how taps fit each other, and the other camera
+_FEW = 500  # bright pixels, or points that both cameras see, below which nothing is said of that
+_SPREAD = (
+    0.05  # rad; better than that multipath and edges let no phase agree with the stereo camera's distances
+)
 _FAINT = 50.0  # raw units; changes of fainter blocks are told in parts of this
 
 
@@ -69,6 +75,10 @@ _BUFFERS = "the camera hands out old buffers: open the station anew"
 _PROJECTOR = "is its projector on, and the scene within its range?"
 _RANGE = "is the rig right, and the distance within the stereo camera's range?"
 _DULL = "lengthen the exposure, come nearer, or leave such objects out"
+_ORDER = (
+    "frequencies swapped, or phases in another order or sign: tofcapture calibrate phase-order finds them"
+)
+_REACH = "come nearer, state the camera's reach, or use one more or a lower frequency"
 # fmt: off
 LIMITS = (
     Limit("motion_m", 0.2e-3, REFUSE, "the arm moved by {0:.2g} m during the exposures", _SETTLE),
@@ -77,6 +87,9 @@ LIMITS = (
     Limit("stale_frames", 0, REFUSE, "{0:.0f} frames are older than the pose, out of order or repeated", _BUFFERS),
     Limit("unlit", 0.98, REFUSE, "{0:.0%} of the ToF image got no light back", "is the illumination on, the lens cap off?"),
     Limit("stereo_coverage", 0.02, REFUSE, "the stereo camera measured {0:.1%} of its image", _PROJECTOR, least=True),
+    Limit("misfit", 0.25, REFUSE, "the taps fit no cosine of the phases that the driver states: {0:.0%} of the amplitude is left over", _ORDER),
+    Limit("misread", 2.0, REFUSE, "the phases fit the stereo camera's depths {0:.1f} times better with other frequencies or signs", _ORDER),
+    Limit("out_of_reach", 0.5, REFUSE, "{0:.0%} of the scene lies where the ToF frequencies cannot tell its distance", _REACH),
     Limit("frame_drops", 0, RETAKE, "{0:.0f} frames were dropped within the burst", _LINK),
     Limit("flicker", 0.03, RETAKE, "the light changed by {0:.1%} between the frames", "keep people and lamps out of sight; shade the sun"),
     Limit("saturated", 0.05, NOTE, "{0:.0%} of the ToF pixels are saturated", "shorten the exposure; dull what shines"),
@@ -95,9 +108,8 @@ def measure(
     ``frames`` ToF frames were asked for.
     """
     info = tof.info
-    amplitude = np.abs(mean_phasors(tof.raw, info.modulation_hz, info.phase_rad, offset=info.offset)).min(
-        axis=0
-    )
+    phasor = mean_phasors(tof.raw, info.modulation_hz, info.phase_rad, offset=info.offset)
+    amplitude = np.abs(phasor).min(axis=0)
     shift, turn = moved(before.T_base_flange, after.T_base_flange)
     dark = float((amplitude < DARK).mean())
     times = np.asarray(tof.time_ns, dtype=np.int64)
@@ -112,6 +124,8 @@ def measure(
         "unlit": dark,
         "stereo_coverage": float(np.isfinite(stereo.points[..., 2]).mean()),
         "overlap": _overlap(stereo, rig),
+        "misfit": _misfit(tof, phasor),
+        **_against_stereo(phasor, info, stereo, rig),
     }
     if len(tof.raw) >= 3:
         found["flicker"] = _flicker(tof.raw)
@@ -168,6 +182,58 @@ def _overlap(stereo: StereoFrame, rig: Rig) -> float:
     edges = ((-0.5, camera.height - 0.5), (-0.5, camera.width - 0.5))
     hit = np.histogram2d(v, u, bins=cells, range=edges)[0]
     return float((hit > 0).mean())
+
+
+def _misfit(tof: TofBurst, phasor: Complex128) -> float:
+    """Median of what lit pixels' taps leave beside offset and phasor, over the amplitude: 0 where three phases leave nothing to see."""
+    info, mean = tof.info, tof.raw.mean(axis=0, dtype=np.float64)
+    left = [0.0]
+    for z, f in zip(phasor, frequencies(info.modulation_hz), strict=True):
+        k = np.flatnonzero(np.equal(info.modulation_hz, f))
+        rest = mean[k] - (z * np.exp(1j * np.array(info.phase_rad)[k])[:, None, None]).real
+        rest = rest - rest.mean(axis=0) * info.offset
+        lit = (np.abs(z) > _BRIGHT) & ~info.saturated(tof.raw).any(axis=(0, 1))
+        if len(k) > 2 + info.offset and lit.sum() > _FEW:
+            left.append(float(np.median(np.sqrt(np.square(rest).mean(axis=0))[lit] / np.abs(z)[lit])))
+    return max(left)
+
+
+def _against_stereo(phasor: Complex128, info: TofInfo, stereo: StereoFrame, rig: Rig) -> dict[str, float]:
+    """Hold phases against the stereo camera's distances, whatever constant lies between them, and distances against the reach.
+
+    ``misread`` is by how much another frequency of the camera, or the other sign, makes the phases agree better; 0 where they agree.
+    """
+    points = stereo.points[
+        :: max(1, stereo.points.shape[0] // _COLUMNS), :: max(1, stereo.points.shape[1] // _COLUMNS)
+    ]
+    points = points.reshape(-1, 3).astype(np.float64)
+    points = transform_points(rig.T_tof_stereo, points[np.isfinite(points).all(axis=1)])
+    pixels = rig.tof.project(points)[0]
+    inside_image = (pixels > -0.5).all(axis=1) & (pixels < [rig.tof.width - 0.5, rig.tof.height - 0.5]).all(
+        axis=1
+    )
+    u, v = np.rint(pixels[inside_image]).astype(np.intp).T
+    points = points[inside_image]
+    range_ = (np.linalg.norm(points, axis=1) + np.linalg.norm(points - info.illuminator, axis=1)) / 2
+    z = phasor[:, v, u]
+    lit = np.abs(z).min(axis=0) > _BRIGHT
+    if lit.sum() < _FEW or phasor.shape[1:] != rig.tof.shape:
+        return {"misread": 0.0, "out_of_reach": 0.0}
+    hz = frequencies(info.modulation_hz)
+    low, high = info.reach or (0.0, unambiguous(hz))
+    unit = z[:, lit] / np.abs(z[:, lit])
+    back = [np.exp(-4j * np.pi / SPEED_OF_LIGHT * f * range_[lit]) for f in hz]
+    worse = [0.0]
+    for i, own in enumerate(unit):
+        spread = [[_spread(each * b) for b in back] for each in (own, own.conj())]
+        stated, best = spread[0][i], min(map(min, spread))
+        worse.append(stated / max(best, _SPREAD) if stated > 4 * _SPREAD else 0.0)
+    return {"misread": max(worse), "out_of_reach": float(((range_ < low) | (range_ > high)).mean())}
+
+
+def _spread(unit: Complex128) -> float:
+    """Return the circular standard deviation of unit phasors, radians."""
+    return float(np.sqrt(-2 * np.log(np.clip(np.abs(unit.mean()), 1e-9, 1 - 1e-9))))
 
 
 def _flicker(raw: NDArray[Any]) -> float:
