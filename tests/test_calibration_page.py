@@ -139,7 +139,9 @@ def test_page_stands_alone(recording, drawn):
     page = out.read_text()
     assert "<script" not in page
     assert not re.search(r'(?:src|href)="(?!#|data:)', page)
-    answers.hold("evidence-page", answers.of_page(page), off=0.05, least=0.02)
+    answers.hold(
+        "evidence-page", answers.of_page(page), off=0.05, least=0.02, names=[(recording, "RECORDING")]
+    )
     pictures.hold("evidence", drawn)
     charts_found = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
     assert len(charts_found) >= 8
