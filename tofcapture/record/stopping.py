@@ -36,32 +36,18 @@ Action = Callable[[], object]
 
 
 class Stop:
-    """What an order to stop does to one run; once heard it holds, also for what is added later."""
+    """What an order to stop does to one run; once heard it holds."""
 
     def __init__(self, what: str, *actions: Action) -> None:
         self.what = what  # is stopped, in words
-        self._actions, self._heard, self._lock = list(actions), False, threading.Lock()
+        self._actions, self._heard = actions, False
 
     def hear(self) -> None:
         """Stop everything; raises what an action raises, when all were tried."""
-        with self._lock:
-            self._heard, actions = True, list(self._actions)
-        errors = []
-        for action in actions:
-            try:
-                action()
-            except Exception as err:  # the others must be stopped all the same
-                errors.append(err)
-        if errors:
-            raise errors[0]
-
-    def add(self, action: Action) -> None:
-        """Add something that stops what has just been opened; at once, when the order was heard before."""
-        with self._lock:
-            self._actions.append(action)
-            heard = self._heard
-        if heard:
-            action()
+        self._heard = True
+        with contextlib.ExitStack() as stack:
+            for action in reversed(self._actions):
+                stack.callback(action)
 
     def check(self) -> None:
         """Raise :class:`Stopped` when the order was heard."""
