@@ -1,6 +1,6 @@
 """How fast raw frames become depth, confidence and flags, and how often each way to unwrap fails in the dark.
 
-    python benchmarks/decode.py [--seconds 4] [--frames 4] [--points shared/realdata/azure_kinect_phases]
+    python benchmarks/decode.py [--seconds 4] [--frames 4] [--points ../shared/realdata/azure_kinect_phases]
 
 One core, CPU time: 8 x 180 x 240 uint16 with the range errors, lamp offset and temperature of a real sensor. Beside the decoder
 stands a plain numpy script (float32 where numpy keeps it, ``arctan2``, no flags), measured in turns in the same run. The second
@@ -248,7 +248,7 @@ def main() -> None:
     parser.add_argument(
         "--points",
         type=Path,
-        default=Path("shared/realdata/azure_kinect_phases"),
+        default=Path(__file__).resolve().parents[2] / "shared/realdata/azure_kinect_phases",
         help="folder of the nine real points",
     )
     args = parser.parse_args()

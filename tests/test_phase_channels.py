@@ -24,7 +24,7 @@ from tofcapture.rig import RangeError, Rig, dumps_rig, image_places, loads_rig, 
 
 CAMERA = Camera(40, 30, 33.0, 34.0, 19.2, 15.4)
 QUARTERS, THIRDS = tuple(np.pi / 2 * k for k in range(4)), tuple(2 * np.pi / 3 * k for k in range(3))
-POINTS = Path(__file__).parents[1] / "shared/realdata/azure_kinect_phases/nfov.csv"
+POINTS = Path(__file__).resolve().parents[2] / "shared/realdata/azure_kinect_phases/nfov.csv"
 PRESETS = (
     "paper", "arducam-b0410-far", "arducam-b0548", "ti-opt8241", "real3-45-38", "real3-80-60", "oak-tof", "epc660", "adtf3175",
     "adsd3100-two", "azure-kinect", "femto-bolt", "kinect-v2",
@@ -327,6 +327,7 @@ def test_the_same_taps_give_the_same_bits():
     assert digest.hexdigest()[:16] == "02cc75800134b1b2"
 
 
+@pytest.mark.realdata
 @pytest.mark.skipif(not POINTS.is_file(), reason="the nine measured points are not here")
 def test_nine_points_of_a_real_camera_of_three_frequencies():
     """Tape-measured points of an Azure Kinect, with its author's offsets and slopes: every wrap agrees with the tape."""

@@ -60,7 +60,8 @@ def redraw_frame(frame: Frame, generator: torch.Generator, burst: BurstNoise) ->
 
 def _phasors(frame: Frame, raw: Tensor) -> tuple[Tensor, ...]:
     """Compute the phasors (B, 2, H, W) of taps (B, K, H, W), of each frequency as ``frame.modulation`` has them."""
-    return torch.einsum("bck,bkhw->bchw", frame.demodulation, raw).split(2, dim=1)
+    phasors = torch.einsum("bck,bkhw->bchw", frame.demodulation, raw)
+    return phasors.chunk(phasors.shape[1] // 2, dim=1)
 
 
 def redraw_calibration(frame: Frame, generator: torch.Generator, radians: float) -> Frame:
