@@ -24,7 +24,7 @@ from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.light import exact_view
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
 from tofcapture.devices.sim.world import SimWorld
-from tofcapture.errors import ConfigError, DataError
+from tofcapture.errors import ConfigError, DataError, TofError
 from tofcapture.files.check import check
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import load_manifest
@@ -382,6 +382,15 @@ def test_a_rig_that_looks_elsewhere_fails_all(recording, tmp_path):
     result = build_dataset([recording], tmp_path / "out", path, jobs=1)
     assert set(result.failures) == {"box", "mug", "gear"}
     assert "any of 2 views" in result.failures["box"].message
+
+
+def test_an_out_that_cannot_be_written_is_refused_at_once(recording, tmp_path):
+    """Below a file there is no folder: that is said before any view is read, with the option to change."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(TofError) as caught:
+        build_dataset([recording], tmp_path / "file" / "out", jobs=1)
+    assert "name another folder: --out" in caught.value.hint
+    assert (tmp_path / "file").read_text() == ""
 
 
 def test_what_cannot_be_built_is_refused(recording, tmp_path):
