@@ -151,11 +151,41 @@ def published():
     )
 
 
+def halves(draws=60):
+    """Print how far random halves of MoveIt's samples are apart in their combined sigmas, and what a wrong target size does."""
+    path = SHARED / "hand_eye_moveit" / "pose_samples.json"
+    if not path.exists():
+        return
+    A, B = np.swapaxes(json.loads(path.read_text()), 0, 1)
+    rng, total, axes = np.random.default_rng(0), [], []
+    for _ in range(draws):
+        order = rng.permutation(len(A))
+        one, two = (solve_hand_eye(A[i], B[i], eye_to_hand=True) for i in np.array_split(order, 2))
+        off = np.r_[one.X[:3, 3] - two.X[:3, 3], rotation_log(one.X[:3, :3] @ two.X[:3, :3].T)]
+        sigma = np.sqrt(np.diag(one.covariance + two.covariance))
+        total.append([np.linalg.norm(off[h]) / np.linalg.norm(sigma[h]) for h in (slice(0, 3), slice(3, 6))])
+        axes.append(np.abs(off) <= sigma)
+    moved, turned = np.median(total, axis=0)
+    print(
+        f"halves of hand_eye_moveit, {draws} draws: {moved:.2f} (translation) and {turned:.2f} (rotation) combined sigma, medians"
+    )
+    print(f"  of the total of three axes; 1 sigma of an axis covers {100 * np.mean(axes):.0f} %")
+    truth = solve_hand_eye(A, B, eye_to_hand=True).X
+    for factor in (1 / 1.2, 1 / 1.06, 1.01, 1.03, 1.06, 1.11, 1.2):
+        large = B.copy()
+        large[:, :3, 3] *= factor
+        result = solve_hand_eye(A, large, eye_to_hand=True)
+        print(
+            f"  target times {factor:.3f}: {result.verdict}, X {errors(result.X, truth)[1]:.2f} mm off, scale {result.scale[0]:.4f}"
+        )
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=60)
     args = parser.parse_args()
     published()
+    halves()
     compare(args.seeds)
 
 

@@ -240,7 +240,7 @@ def test_eth_streams_repeat():
     hand, seen = (read_poses(next(ETH.glob(name))) for name in ("*hinge.csv", "*target_ir.csv"))
     target = make_stream(seen.seconds, invert_all(seen.usual), "target")
     A, B, _ = stream_pairs(make_stream(hand.seconds, hand.usual, "hand"), target, -0.0157)
-    one, two = (solve_hand_eye(A[s], B[s], blocks=10) for s in (slice(0, 100), slice(100, 200)))
+    one, two = (solve_hand_eye(A[s], B[s]) for s in (slice(0, 100), slice(100, 200)))
     turned, moved = apart(one.X, two.X)
     assert moved < 0.01
     assert turned < np.radians(0.3)
@@ -271,7 +271,7 @@ def test_time_offset_is_found(clock):
     assert abs(found["time_offset_s"] - 0.137 - origin) < 0.001
     assert found["time_offset_sigma_s"] < 0.001
     assert says in "; ".join(found["clocks"]["hand"])
-    assert apart(solve_hand_eye(A, B, blocks=10).X, X)[1] < 0.002
+    assert apart(solve_hand_eye(A, B).X, X)[1] < 0.002
 
 
 @pytest.mark.parametrize("unit", clocks.SECONDS)

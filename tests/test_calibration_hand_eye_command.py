@@ -170,9 +170,7 @@ def test_files_of_pairs_give_the_pairs(tmp_path, name):
     hand, target, meant = agreed(*read_pairs(tmp_path / name))
     np.testing.assert_allclose(hand, HAND, atol=1e-6)
     np.testing.assert_allclose(target, TARGET, atol=1e-6)
-    unsaid = {
-        k: v for k, v in meant.said.items() if v not in {"rotation vectors", "inverted, as its name says"}
-    }
+    unsaid = {k: v for k, v in meant.said.items() if v not in {"rotation vectors", "inverted, as was told"}}
     assert unsaid == {}
     assert meant.rivals == ()
 

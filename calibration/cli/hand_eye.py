@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from calibration.hand_eye.solve import HandEye
     from tofcapture.frames import View
 
-STREAM_BLOCKS = 20  # stretches of a stream whose errors are taken as independent
-
 
 def configure_hand_eye(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
@@ -65,13 +63,12 @@ def run_hand_eye(args: argparse.Namespace) -> Outcome:
     """Calibrate from a file of pairs, two streams, or a recording."""
     from calibration.hand_eye.solve import solve_hand_eye, to_dict
 
-    hand, target, extra, blocks = _pairs(args)
+    hand, target, extra = _pairs(args)
     free = args.target_scale == "free"
     result = solve_hand_eye(
         hand,
         target,
         eye_to_hand=args.eye_to_hand,
-        blocks=blocks,
         free_scale=free,
         target_scale=None if free else _factor(args.target_scale),
     )
@@ -92,8 +89,8 @@ def _factor(text: str | None) -> float | None:
     return factor
 
 
-def _pairs(args: argparse.Namespace) -> tuple[Float64, Float64, dict[str, Any], int | None]:
-    """Hand and target poses, what is said of them, and how many blocks of a stream share their errors."""
+def _pairs(args: argparse.Namespace) -> tuple[Float64, Float64, dict[str, Any]]:
+    """Hand and target poses, and what is said of them."""
     from calibration.hand_eye.files import read_pairs, read_poses
     from calibration.hand_eye.pairs import decided, recording_pairs
     from calibration.hand_eye.readings import agreed
@@ -102,7 +99,7 @@ def _pairs(args: argparse.Namespace) -> tuple[Float64, Float64, dict[str, Any], 
     if len(paths) == 1 and paths[0].is_dir():
         with kit.progress() as progress:
             hand, target = recording_pairs(paths[0], progress)
-        return hand, _turned(target, args), {"camera": "stereo"}, None
+        return hand, _turned(target, args), {"camera": "stereo"}
     if len(paths) > 2:
         raise UsageError(
             f"expected one file of pairs, one recording, or two files of poses, got {len(paths)} paths"
@@ -114,7 +111,7 @@ def _pairs(args: argparse.Namespace) -> tuple[Float64, Float64, dict[str, Any], 
     together = not timed or bool(np.array_equal(one.seconds, two.seconds))  # type: ignore[arg-type]
     if len(one) == len(two) and args.time_offset is None and together:
         hand, target, meant = agreed(one, two)
-        return hand, _turned(target, args), meant.report(), None
+        return hand, _turned(target, args), meant.report()
     if one.seconds is None or two.seconds is None:
         raise DataError(
             f"expected as many poses in both files, or times before them, got {len(one)} and {len(two)} poses"
@@ -122,12 +119,12 @@ def _pairs(args: argparse.Namespace) -> tuple[Float64, Float64, dict[str, Any], 
     hand, target, found = decided(
         one, replace(two, inverted=two.inverted ^ args.inverted_target), args.time_offset
     )
-    return hand, target, {"stream": True, **found}, min(STREAM_BLOCKS, len(hand) // 5)
+    return hand, target, {"stream": True, **found}
 
 
 def _read_as(args: argparse.Namespace, side: str) -> list[str]:
     """Words that ``--read-as hand=ZYX,deg`` says of a side."""
-    words = []
+    words: list[str] = []
     for given in args.read_as:
         who, _, what = given.partition("=")
         if who not in {"hand", "target", "both"} or not what:

@@ -62,8 +62,7 @@ REMEDIES = {
     ".db3": "write the poses as CSV: t,x,y,z,qx,qy,qz,qw",
     ".xlsx": "save the sheet as CSV",
     ".xls": "save the sheet as CSV",
-    ".pkl": "numpy.savez('poses.npz', R_gripper2base=..., t_gripper2base=..., R_target2cam=..., t_target2cam=...)",
-    ".pickle": "numpy.savez('poses.npz', R_gripper2base=..., t_gripper2base=..., R_target2cam=..., t_target2cam=...)",
+    ".pkl": "numpy.savez('poses.npz', hand=..., target=...) with (N, 4, 4) arrays",
     ".h5": "numpy.savez('poses.npz', hand=..., target=...) with (N, 4, 4) arrays",
     ".png": "hand-eye takes poses: detect the target first, or give a calibration recording",
     ".jpg": "hand-eye takes poses: detect the target first, or give a calibration recording",
@@ -297,7 +296,7 @@ def _of_rows(rows: Float64, where: str, usual: str = "", unit: str = "", angles:
         raise DataError(f"{where}: expected finite numbers, got NaN or infinity in pose {bad}")
     width = rows.shape[1]
     if width in {12, 16}:
-        return _of_matrices(rows, unit)
+        return _of_matrices(rows, where, unit)
     xyz, turn = rows[:, :3], rows[:, 3:]
     if width == 6:
         names = angle_names(turn, usual or "rotvec")
@@ -324,45 +323,30 @@ def _unit(turn: Float64) -> bool:
     return bool(np.abs(np.linalg.norm(turn, axis=1) - 1).max() <= UNIT_LENGTH)
 
 
-def _of_matrices(rows: Float64, unit: str) -> Readings:
-    """Read matrices (N, 12) or (N, 16) by rows, by columns, or with the rotation before or after the translation."""
+def _of_matrices(rows: Float64, where: str, unit: str) -> Readings:
+    """Read matrices (N, 12) or (N, 16) by rows or by columns, or rotations before or after translations (N, 12)."""
     n, width = rows.shape
-    if width == 16:
-        forms = {
-            "": (rows.reshape(n, 4, 4), False),
-            "by columns": (rows.reshape(n, 4, 4).swapaxes(1, 2), False),
-        }
-        at = {k: (T[:, :3, :3], T[:, :3, 3], T[:, 3]) for k, (T, _) in forms.items()}
-        name = "" if np.abs(at[""][2] - [0, 0, 0, 1]).max() <= 1e-6 else "by columns"
-        if np.abs(at[name][2] - [0, 0, 0, 1]).max() > 1e-6:
-            name = ""
-            _last_row(at[name][2])
-        R, t, _ = at[name]
-    else:
-        by = rows.reshape(n, 3, 4)
-        columns = rows.reshape(n, 4, 3).swapaxes(1, 2)
-        layouts = {
-            "": (by[:, :, :3], by[:, :, 3]),
-            "rotation, then translation": (rows[:, :9].reshape(n, 3, 3), rows[:, 9:]),
-            "by columns": (columns[:, :, :3], columns[:, :, 3]),
-            "translation, then rotation": (rows[:, 3:].reshape(n, 3, 3), rows[:, :3]),
-        }
-        fits = [
-            k for k, (R, _) in layouts.items() if np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max() < ORTHOGONAL
-        ]
-        name = fits[0] if fits else ""
-        R, t = layouts[name]
-    return Readings(
-        t, R, ("matrix",), unit=unit, notes=("matrices by columns",) if name == "by columns" else ()
-    )
+    forms = {"": rows.reshape(n, -1, 4), "by columns": rows.reshape(n, 4, -1).swapaxes(1, 2)}
+    if width == 12:
+        parts = ((rows[:, :9], rows[:, 9:]), (rows[:, 3:], rows[:, :3]))
+        forms |= {f"parts {i}": np.dstack([R.reshape(n, 3, 3), t]) for i, (R, t) in enumerate(parts)}
+    fits = [
+        k for k, T in forms.items() if np.abs(T[:, 3:] - [0, 0, 0, 1]).max(initial=0) < 1e-6 and _turns(T)
+    ]
+    name = next(iter(fits), "")
+    T, last = forms[name], np.abs(forms[name][:, 3:] - [0, 0, 0, 1]).max(axis=(1, 2), initial=0)
+    if last.max() > 1e-6:
+        raise DataError(
+            f"{where}: expected rigid transforms, got a last row other than 0 0 0 1 in pose {int(np.argmax(last))}",
+            "the matrix may hold a scale, or not be a pose",
+        )
+    notes = ("matrices by columns",) if name == "by columns" else ()
+    return Readings(T[:, :3, 3], T[:, :3, :3], ("matrix",), unit=unit, notes=notes)
 
 
-def _last_row(last: Float64) -> None:
-    bad = int(np.argmax(np.abs(last - [0, 0, 0, 1]).max(axis=1) > 1e-6))
-    raise DataError(
-        f"expected rigid transforms, got a last row {last[bad].tolist()} in pose {bad}",
-        "the matrix may hold a scale, or not be a pose",
-    )
+def _turns(T: Float64) -> bool:
+    R = T[:, :3, :3]
+    return bool(np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max() < ORTHOGONAL)
 
 
 def _table(text: str, where: str) -> tuple[Float64, list[str]]:
@@ -564,7 +548,7 @@ def _yaml(text: str, path: Path) -> Any:
             f"{path}: reading YAML needs PyYAML", hint="pip install pyyaml, or convert to JSON"
         ) from err
 
-    class Loader(yaml.SafeLoader):
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]
         """Knows the tag of OpenCV's matrices."""
 
     Loader.add_constructor(

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.hand_eye.checks import Cause, HandEyeRefused, slide_ratio, thinned
 from calibration.hand_eye.closed_form import SCALE, distances, invert_all, residuals, rotation_vectors, shah
@@ -93,7 +94,7 @@ class Readings:
         unit = self.unit or min(UNITS, key=lambda u: _size_cost(self, u, 0))
         return self.poses(self.names[0], unit)
 
-    def take(self, chosen: object) -> Readings:
+    def take(self, chosen: NDArray[np.intp]) -> Readings:
         """Return the poses of these indices alone."""
         seconds = None if self.seconds is None else self.seconds[chosen]
         return replace(self, xyz=self.xyz[chosen], turn=self.turn[chosen], seconds=seconds)
@@ -208,7 +209,7 @@ def _by_angles(hand: Readings, target: Readings) -> list[tuple[str, str]]:
 def _angles(R: Float64) -> Float64:
     i, j = np.triu_indices(len(R), 1)
     gap = np.linalg.norm(R[i] - R[j], axis=(1, 2))
-    return 2 * np.arcsin(np.minimum(gap / np.sqrt(8), 1))
+    return np.asarray(2 * np.arcsin(np.minimum(gap / np.sqrt(8), 1)))
 
 
 def _finalists(
@@ -315,6 +316,6 @@ def _said(readings: Readings, name: str, unit: str) -> str:
     plain = name in {"xyzw", "matrix"} or (name == "rotvec rad" and readings.told)
     words = [] if plain else [_name(name)]
     words += [LONG[unit]] if unit != "m" and (not readings.unit or unit != "m") else []
-    words += ["inverted, as its name says"] if readings.inverted else []
+    words += ["inverted, as was told"] if readings.inverted else []
     words += readings.notes
     return ", ".join(words)

@@ -21,6 +21,7 @@ FLOOR = (1e-7, 1e-7)  # m, rad; keeps noise-free data solvable
 ITERATIONS = 60
 STOP = 1e-8  # m, rad
 LEAST_LEFT = 0.02  # of a direction that only one group determines: its own residual tells nothing there
+SHARED = 2.5  # standard deviations by which an autocorrelation counts
 SMALL = 3  # pairs that determine a calibration
 SANDWICH = 12  # pairs from which on their own scatter is believed more than the model
 
@@ -68,7 +69,6 @@ def refine(
     X: Float64,
     Z: Float64,
     noise: tuple[float, float],
-    blocks: int | None = None,
     *,
     eye_to_hand: bool = False,
     free_scale: bool = False,
@@ -76,8 +76,7 @@ def refine(
     """Refine X and Z, and with ``free_scale`` the target's size, by Gauss-Newton inside expectation-maximisation.
 
     P and B are (N, 4, 4) pairs, N >= 3; P is T_flange_base, not T_base_flange, where ``eye_to_hand``. X and Z are the start,
-    (4, 4), ``noise`` is a first guess of the noise per axis, metres and radians. ``blocks`` are stretches of consecutive pairs that
-    share their errors (streams); each pair is its own when None.
+    (4, 4), ``noise`` is a first guess of the noise per axis, metres and radians.
     """
     whole = np.repeat(np.square(np.maximum(noise, FLOOR)), 3)
     camera, arm = np.diag(whole / 2), whole / 2
@@ -95,7 +94,7 @@ def refine(
             break
     scatter = _total(camera, arm, _lever(P, X, Z, eye_to_hand=eye_to_hand))
     weight = _weights(r, _inverse(scatter))
-    return Refined(X, Z, r, scatter, *_uncertainty(J, r, weight, scatter, blocks), scale)
+    return Refined(X, Z, r, scatter, *_uncertainty(J, r, weight, scatter), scale)
 
 
 def _linearised(
@@ -187,13 +186,11 @@ def _solve(J: Float64, r: Float64, weight: Float64, information: Float64) -> Flo
     return np.asarray(-np.linalg.lstsq(left, right, rcond=None)[0], dtype=np.float64)
 
 
-def _uncertainty(
-    J: Float64, r: Float64, weight: Float64, scatter: Float64, blocks: int | None
-) -> tuple[Float64, Float64]:
+def _uncertainty(J: Float64, r: Float64, weight: Float64, scatter: Float64) -> tuple[Float64, Float64]:
     """Covariance and left-out residuals.
 
     A left-out solution is one Newton step away from the full one, since the problem is nearly linear there. The covariance is the
-    scatter of the scores of pairs or blocks, each divided by the root of what it did not pull towards itself (CR2 of Bell and
+    scatter of the pairs' scores, each divided by the root of what it did not pull towards itself (CR2 of Bell and
     McCaffrey, 2002): it holds when the noise model does not. Few scores are themselves noisy, so the model of independent pairs
     counts as a dozen of them, and what is left is widened as Student's t is. Below a dozen pairs the model is believed.
     """
@@ -206,18 +203,29 @@ def _uncertainty(
         if np.linalg.cond(rest) < 1e14:
             left_out[i] = r[i] + J[i] @ np.linalg.solve(rest, score[i])
     inverse = np.linalg.pinv(H) / _curvature(weight)
-    groups = len(r) if blocks is None else blocks
-    wider = (groups - 2) / (groups - 4) if groups > 2 * SMALL else 2.0
-    if groups < SANDWICH:
+    n = len(r)
+    wider = (n - 2) / (n - 4) if n > 2 * SMALL else 2.0
+    wider *= _shared(r, weight, scatter, len(H))
+    if n < SANDWICH:
         return inverse * wider, left_out
-    scores, shares = (
-        np.stack([b.sum(axis=0) for b in np.array_split(values, groups)]) for values in (score, each)
-    )
-    freed = _freed(H, shares, scores)
+    freed = _freed(H, each, score)
     sandwich = inverse @ (freed.T @ freed) @ inverse
-    if blocks is None:
-        sandwich = (groups * sandwich + SANDWICH * inverse) / (groups + SANDWICH)
-    return sandwich * wider, left_out
+    return (n * sandwich + SANDWICH * inverse) / (n + SANDWICH) * wider, left_out
+
+
+def _shared(r: Float64, weight: Float64, scatter: Float64, unknowns: int) -> float:
+    """Factor by which pairs that share errors with those before them tell less: one and twice the sum of their autocorrelations.
+
+    Only lags up to the first that is not significant count, so single shots in any order give one. A fit lowers each by its unknowns.
+    """
+    white = np.linalg.solve(np.linalg.cholesky(scatter), r[..., None])[..., 0] * np.sqrt(weight)[:, None]
+    total, power = 1.0, float(np.square(white).mean())
+    for lag in range(1, len(r) // 4 + 1):
+        rho = float((white[lag:] * white[:-lag]).mean()) / max(power, 1e-300) + unknowns / r.size
+        if rho < SHARED / np.sqrt(r.size):
+            break
+        total += 2 * min(rho, 1.0)
+    return total
 
 
 def _curvature(weight: Float64) -> float:
@@ -227,14 +235,14 @@ def _curvature(weight: Float64) -> float:
 
 
 def _freed(H: Float64, shares: Float64, scores: Float64) -> Float64:
-    """Scores (G, p) divided by the root of one minus the group's share of the normal equations (G, p, p)."""
+    """Scores (N, p) divided by the root of one minus the pair's share of the normal equations (N, p, p)."""
     value, vector = np.linalg.eigh(H)
     value = np.maximum(value, 1e-12 * value.max())
     root, back = vector * np.sqrt(value), (vector / np.sqrt(value)).T
     share, axes = np.linalg.eigh(back @ shares @ back.T)
     left = 1 / np.sqrt(np.clip(1 - share, LEAST_LEFT, 1))
-    turned = np.einsum("gij,gi->gj", axes, scores @ back.T) * left
-    out: Float64 = np.einsum("gij,gj->gi", axes, turned) @ root.T
+    turned = np.einsum("nij,ni->nj", axes, scores @ back.T) * left
+    out: Float64 = np.einsum("nij,nj->ni", axes, turned) @ root.T
     return out
 
 

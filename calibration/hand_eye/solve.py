@@ -82,15 +82,14 @@ def solve_hand_eye(
     target: ArrayLike,
     *,
     eye_to_hand: bool = False,
-    blocks: int | None = None,
     target_scale: float | None = None,
     free_scale: bool = False,
 ) -> HandEye:
     """Calibrate hand and eye from pairs of poses, or refuse by name.
 
     ``hand`` is (N, 4, 4) T_base_flange, ``target`` (N, 4, 4) T_camera_target of the same moments, metres. With ``eye_to_hand`` the
-    camera stands beside the arm and sees a target on the flange. ``blocks`` are stretches of consecutive pairs that share their errors,
-    for the covariance of streams; None for single shots. Pairs that repeat others count once.
+    camera stands beside the arm and sees a target on the flange. Pairs that repeat others count once,
+    and consecutive ones that share their errors (streams) widen the error bars.
 
     The target's size is believed unless the pairs contradict it by three sigma. They are then solved with the size that fits, its
     error within the covariance, and the verdict is FAIL where that is 1 % off. ``free_scale`` accepts whatever size fits,
@@ -101,7 +100,7 @@ def solve_hand_eye(
     """
     A, B = clean(hand, "hand poses"), clean(target, "target poses")
     check_numbers(A, B)
-    A, B, place = once(A, B) if blocks is None else (A, B, np.arange(len(A)))
+    A, B, place = once(A, B)
     check_numbers(A, B, repeated=len(place) - len(A))
     motion = check_motion(A, B)
     check_pairing(A, B)
@@ -110,9 +109,7 @@ def solve_hand_eye(
     check_agreement(A, scaled(B, size), start, eye_to_hand=eye_to_hand)
 
     def fit(X: Float64, Z: Float64, *, given: float = 1.0, free: bool = False) -> Refined:
-        return refine(
-            P, scaled(B, given), X, Z, start.noise, blocks, eye_to_hand=eye_to_hand, free_scale=free
-        )
+        return refine(P, scaled(B, given), X, Z, start.noise, eye_to_hand=eye_to_hand, free_scale=free)
 
     own = fit(start.X, start.Z, given=size, free=True)
     factor = size * own.scale
