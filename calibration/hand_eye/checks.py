@@ -18,7 +18,6 @@ SINGLE_AXIS = np.radians(2.0)  # RMS rotation across the main axis
 MISMATCH = 0.4  # of the angle difference that random pairing has
 REACH = 20.0  # m; no arm reaches farther, so longer translations are millimetres
 ORTHONORMAL = 1e-3  # rotations printed with four digits pass, scaled or sheared ones do not
-CLEAR = 0.7  # correlation of slides from which on their ratio is believed
 COUPLES = 120  # pairs whose couples are compared; more cost time and change no verdict
 
 FAULTS = (
@@ -174,16 +173,6 @@ def slide_mismatch(A: Float64, B: Float64) -> float:
     (a, along_a), (_, along_b) = (_screws(M) for M in _couples(A, B))
     turned = (a > SMALL_ROTATIONS) & (a < np.radians(170))
     return float(np.median(np.abs(along_a - along_b)[turned])) if turned.any() else float("nan")
-
-
-def slide_ratio(A: Float64, B: Float64) -> float:
-    """Return how many times farther the hand slides along its screws than the target: the ratio of their units; NaN if unclear."""
-    (a, along_a), (_, along_b) = (_screws(M) for M in _couples(A, B))
-    turned = (a > SMALL_ROTATIONS) & (a < np.radians(170))
-    one, two = np.abs(along_a[turned]), np.abs(along_b[turned])
-    if len(one) < 3 or min(one.std(), two.std()) == 0 or np.corrcoef(one, two)[0, 1] < CLEAR:
-        return float("nan")
-    return float(np.sqrt((one @ one) / (two @ two)))
 
 
 def thinned(count: int, most: int) -> NDArray[np.intp]:

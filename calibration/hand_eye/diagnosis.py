@@ -70,7 +70,7 @@ def scaled_consensus(P: Float64, B: Float64) -> tuple[Consensus, float]:
     found, scale = consensus(P, B), 1.0
     for _ in range(SIZINGS):
         kept = found.inliers
-        factor = scale * _linear_scale(P[kept], scaled(B[kept], scale), found.X[:3, :3])
+        factor = scale * linear_scale(P[kept], scaled(B[kept], scale), found.X[:3, :3])
         if not 1 / UNSIZED < factor < UNSIZED:
             break
         other = consensus(P, scaled(B, factor))
@@ -80,7 +80,7 @@ def scaled_consensus(P: Float64, B: Float64) -> tuple[Consensus, float]:
     return found, scale
 
 
-def _linear_scale(P: Float64, B: Float64, rotation: Float64) -> float:
+def linear_scale(P: Float64, B: Float64, rotation: Float64) -> float:
     """Find the factor of the target's distances by least squares in (t_X, t_Z, s) of ``R_P t_X - t_Z + s R_P R_X t_B = -t_P``."""
     n = len(P)
     left = np.zeros((n, 3, 7))

@@ -326,10 +326,11 @@ def _unit(turn: Float64) -> bool:
 def _of_matrices(rows: Float64, where: str, unit: str) -> Readings:
     """Read matrices (N, 12) or (N, 16) by rows or by columns, or rotations before or after translations (N, 12)."""
     n, width = rows.shape
-    forms = {"": rows.reshape(n, -1, 4), "by columns": rows.reshape(n, 4, -1).swapaxes(1, 2)}
+    forms = {"": rows.reshape(n, -1, 4)}
     if width == 12:
         parts = ((rows[:, :9], rows[:, 9:]), (rows[:, 3:], rows[:, :3]))
         forms |= {f"parts {i}": np.dstack([R.reshape(n, 3, 3), t]) for i, (R, t) in enumerate(parts)}
+    forms["by columns"] = rows.reshape(n, 4, -1).swapaxes(1, 2)
     fits = [
         k for k, T in forms.items() if np.abs(T[:, 3:] - [0, 0, 0, 1]).max(initial=0) < 1e-6 and _turns(T)
     ]

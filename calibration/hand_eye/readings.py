@@ -2,7 +2,7 @@
 
 A rigid mount turns hand and camera by the same angle between any two pairs, and moves both equally far along the axis. The angles
 are free of units, of inversion and of mirroring: they rank the rotations' readings. What the angles leave is decided by the
-likelihood of the whole calibration, the units by the slides and by what arms and cameras measure.
+likelihood of the whole calibration, the units by the ratio that fits and by what arms and cameras measure.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.hand_eye.checks import Cause, HandEyeRefused, slide_ratio, thinned
+from calibration.hand_eye.checks import Cause, HandEyeRefused, thinned
 from calibration.hand_eye.closed_form import SCALE, distances, invert_all, residuals, rotation_vectors, shah
+from calibration.hand_eye.diagnosis import linear_scale, scaled
 from calibration.hand_eye.refine import Refined, refined_from_consensus
 from tofcapture.errors import DataError, UsageError
 from tofcapture.poses import Float64
@@ -24,7 +25,11 @@ UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 LONG = {"mm": "millimetres", "cm": "centimetres", "in": "inches", "m": "metres"}
 RARE = {"m": 0.0, "mm": 0.0, "cm": 4.0, "in": 8.0}  # what a unit that no file names is held back by
 SIZES = ((0.6, 0.8), (0.6, 0.7))  # hand and target: usual distance in m, and its spread as a logarithm
-SLIDE = 0.2  # spread of the logarithm of the slides' ratio
+SLIDE = 0.2  # spread of the logarithm of the ratio of units
+RATIOS, UNFIT = (
+    12,
+    0.3,
+)  # readings whose ratio is tried; misfit, as a share of the hand's spread, from which none is believed
 UNSURE = 3.0  # between two choices of units, below which a person is told of the other
 ANGLES = (
     "rotvec", "xyz", "ZYX", "XYZ", "zyx", "about-YXZ", "about-YZX", "about-XZY", "about-ZXY", "ZXY", "YXZ", "YZX", "XZY", "zxy", "yxz",
@@ -158,7 +163,7 @@ def choose(hand: Readings, target: Readings) -> Meant:
     hand, target = hand.take(few), target.take(few)
     usual = hand.names[0], target.names[0]
     pairs = _by_angles(hand, target)
-    units, other = _units(hand, target, pairs[0])
+    units, other = _units(hand, target, pairs)
     if other:
         raise HandEyeRefused(
             Cause.CONVENTION,
@@ -266,20 +271,38 @@ def _differ(one: Refined | None, other: Refined | None) -> bool:
 
 
 def _units(
-    hand: Readings, target: Readings, names: tuple[str, str]
+    hand: Readings, target: Readings, pairs: list[tuple[str, str]]
 ) -> tuple[tuple[str, str], tuple[str, str] | None]:
-    """Units of both sides by the ratio of their slides and by the sizes of arms and views; also others that are nearly as likely."""
-    A, B = hand.poses(names[0], "m"), target.poses(names[1], "m")
-    ratio = slide_ratio(A, B)
+    """Units of both sides by the ratio that fits and by the sizes of arms and views; also others that are nearly as likely."""
+    ratio = _ratio(hand, target, pairs)
     choices = list(product([hand.unit] if hand.unit else UNITS, [target.unit] if target.unit else UNITS))
     cost = {}
     for one, two in choices:
-        off = np.log(max(ratio * UNITS[two] / UNITS[one], 1e-9)) / SLIDE if np.isfinite(ratio) else 0.0
+        off = np.log(max(ratio * UNITS[one] / UNITS[two], 1e-9)) / SLIDE if np.isfinite(ratio) else 0.0
         cost[one, two] = min(off**2, 60.0) + _size_cost(hand, one, 0) + _size_cost(target, two, 1)
         cost[one, two] -= RARE[one] if one == two else 0.0  # one unit for both is one rarity
     ranked = sorted(choices, key=lambda c: cost[c])
     doubtful = len(ranked) > 1 and cost[ranked[1]] - cost[ranked[0]] < UNSURE
     return ranked[0], ranked[1] if doubtful else None
+
+
+def _ratio(hand: Readings, target: Readings, pairs: list[tuple[str, str]]) -> float:
+    """Find how many units of the hand a unit of the target is, under the reading and mount that fit best; NaN where none fits."""
+    ratio, best = (
+        np.nan,
+        UNFIT * float(np.median(np.linalg.norm(hand.xyz - np.median(hand.xyz, axis=0), axis=1))),
+    )
+    tried = [(one + a, two + b) for one, two in pairs[:RATIOS] for a in _ends(one) for b in _ends(two)]
+    for h, t in tried:
+        A, B = hand.poses(h, "m"), target.poses(t, "m")
+        for P in (A, invert_all(A)):
+            factor = linear_scale(P, B, shah(P, B)[0][:3, :3])
+            if factor <= 0:
+                continue
+            seen = scaled(B, factor)
+            misfit = float(np.median(distances(residuals(P, seen, *shah(P, seen)))[0]))
+            ratio, best = (factor, misfit) if misfit < best else (ratio, best)
+    return ratio
 
 
 def _size_cost(readings: Readings, unit: str, side: int) -> float:
