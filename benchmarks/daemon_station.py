@@ -252,10 +252,9 @@ class _Followed:
 
     def __init__(self, hosted: Any, arm: Any) -> None:
         self._hosted, self._arm = hosted, arm
-        self.describe, self.state, self.cautions = arm.describe, arm.state, arm.cautions
-        self.kinematics, self.check_move = (
-            arm.kinematics, arm.check_move,
-        )  # fmt: skip
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._arm, name)
 
     def move_to(self, joints: Any) -> Any:
         self._hosted.move_to(joints)

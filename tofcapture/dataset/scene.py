@@ -34,6 +34,7 @@ from tofcapture.dataset.sample import (
     view_error,
 )
 from tofcapture.errors import DataError, TofError
+from tofcapture.files.disk import full_disk_named
 from tofcapture.files.hdf import dumps
 from tofcapture.files.layout import SHARD, MaskBit
 from tofcapture.files.seal import digest_path, sealed_digest
@@ -136,7 +137,9 @@ def build_scene(
             found = finished(task, inputs)
             if found is not None or only_look:
                 return SceneOutcome(found, skipped=found is not None, peak_memory=_peak_memory())
-            return SceneOutcome(build_shard(task, inputs, pool, progress), peak_memory=_peak_memory())
+            with full_disk_named(task.path):
+                digest = build_shard(task, inputs, pool, progress)
+            return SceneOutcome(digest, peak_memory=_peak_memory())
         except TofError as err:
             return SceneOutcome(error=err, peak_memory=_peak_memory())
 

@@ -401,9 +401,11 @@ class ShardWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._file is not None:
-            self._file.close()
-        self._partial.unlink(missing_ok=True)
+        try:
+            if self._file is not None:
+                self._file.close()
+        finally:
+            self._partial.unlink(missing_ok=True)
 
     def _create(self, file: h5py.File, rows: Mapping[str, Array]) -> None:
         F, K = rows["tof/raw"].shape[:2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,6 +54,13 @@ class Prediction:
     decode_ms: float = math.nan
 
 
+def _npy_bytes(array: NDArray[Any]) -> bytes:
+    """Encode an array; numpy, writing it to a full disk by itself, would not say why it fails."""
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
 def ply_bytes(prediction: Prediction) -> bytes:
     """Encode points, normals and, where there is one, expected error as binary PLY, metres, ToF frame."""
     columns: list[NDArray[Any]] = [prediction.camera.unproject(prediction.depth), prediction.normals]
@@ -94,13 +102,15 @@ def _write(prediction: Prediction, out: Path) -> dict[str, str]:
         for name in ("depth", "normals", "error", "measured")
         if (array := getattr(prediction, name)) is not None
     }
-    for name, array in arrays.items():
-        with replacing(out / name) as partial, partial.open("wb") as file:
-            np.save(file, array)
     tenth_mm = np.clip(np.rint(prediction.depth * 1e4), 0, 65535).astype(np.uint16)
     colours = ((prediction.normals * [1, -1, -1] + 1) * 127.5).clip(0, 255).astype(np.uint8)
-    pictures = {"depth.png": png_bytes(tenth_mm), "normals.png": png_bytes(colours)}
-    for name, data in {**pictures, "cloud.ply": ply_bytes(prediction)}.items():
+    made = {name: _npy_bytes(array) for name, array in arrays.items()}
+    made |= {
+        "depth.png": png_bytes(tenth_mm),
+        "normals.png": png_bytes(colours),
+        "cloud.ply": ply_bytes(prediction),
+    }
+    for name, data in made.items():
         with replacing(out / name) as partial:
             partial.write_bytes(data)
     write_text(
