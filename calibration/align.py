@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from calibration.alignment.diagnosis import check_start, explained
 from calibration.alignment.methods import apply_method, method_named
-from calibration.alignment.rounds import Progress, RefusedPairsError, demand_pairs, solve
+from calibration.alignment.rounds import Progress, RefusedPairsError, demand_pairs, find_start, solve
 from calibration.evidence import evidence_of, write_json
 from calibration.registration.gate import backend_named
 from calibration.registration.pairs import Pair, calibration_views, load_pair
 from tofcapture.errors import DataError
 from tofcapture.files.disk import check_writable
 from tofcapture.files.seal import write_text
+from tofcapture.frames import CALIBRATION
+from tofcapture.pool import Pool
+from tofcapture.poses import invert
 from tofcapture.rig import Rig, dumps_rig
 
 
 def align(
     recording: str | Path,
     backend: str = "open3d",
-    initial: Rig | None = None,
+    initial: Rig | Literal["none"] | None = None,
     progress: Progress = lambda _stage, _done, _total: None,
     method: str = "averaged",
     out: str | Path | None = None,
+    scene: str = CALIBRATION,
 ) -> tuple[Rig, dict[str, Any]]:
     """Align the cameras of a recording by averaged ICP; write ``evidence.json``, then ``rig.toml``.
 
@@ -37,7 +42,7 @@ def align(
     backend
         ``open3d``, ``kiss-icp`` or ``small-gicp``.
     initial
-        Rig to start from; by default the one the first view carries.
+        Rig to start from; by default the one the first view carries. ``none``: no guess, the views themselves tell where to start.
     progress
         Called with a stage, steps done and steps in all.
     method
@@ -45,6 +50,8 @@ def align(
         accepted views that starts at the average and finds the range errors too.
     out
         Folder of ``rig.toml`` and ``evidence.json``; by default the recording.
+    scene
+        Whose views: the board's, or those of any scene of enough relief.
 
     Returns
     -------
@@ -67,8 +74,11 @@ def align(
     recording = Path(recording)
     out = recording if out is None else Path(out)
     check_writable(out, "name a folder that can be written: --out")
-    pairs = _load(recording, progress)
-    start = pairs[0].rig if initial is None else initial
+    pairs = _load(recording, scene, progress)
+    start = initial if isinstance(initial, Rig) else pairs[0].rig
+    if initial == "none":
+        with Pool(1, pinned=True) as pool:
+            start = replace(start, T_tof_stereo=invert(find_start(pairs, pool)))
     check_start(start.T_tof_stereo)
     try:
         solution = solve(pairs, backend, start.T_tof_stereo, progress)
@@ -81,8 +91,8 @@ def align(
     return rig, evidence
 
 
-def _load(recording: Path, progress: Progress) -> list[Pair]:
-    paths = calibration_views(recording)
+def _load(recording: Path, scene: str, progress: Progress) -> list[Pair]:
+    paths = calibration_views(recording, scene)
     demand_pairs(len(paths), [None] * len(paths))
     pairs = []
     for i, path in enumerate(paths):

@@ -1,4 +1,4 @@
-"""The lens from a board with cut-outs: every rim that the ToF camera sees against the nearest edge of the board's model.
+"""The lens from boards: every rim of cut-outs against the nearest edge of the model, every corner of a pattern against its place.
 
 No centre of a hole is measured: a rim pixel's ray meets the board's front, and its distance to the nearest edge, in pixels, is the
 residual. Unknown are the lens, one pose per view, and by how much all plates look too large; ranges play no part. The lens is
@@ -18,7 +18,7 @@ from calibration.registration.clouds import Mask
 from calibration.registration.gate import tukey_weights
 from tofcapture.camera import LENS_NAMES, Camera, distorted, distortion_jacobian
 from tofcapture.errors import ConfigError, DataError, QualityError
-from tofcapture.poses import Float64, exp
+from tofcapture.poses import Float64, exp, transform_points
 
 MIN_VIEWS = 5
 FEW = 500  # rims of a view; the rest repeats them
@@ -36,6 +36,7 @@ NEAR = 0.5  # px, root mean square, up to which a richer lens starts from a poor
 SURER = 0.995  # the same where it also makes rays surer
 WORSE = 1.2  # times the first look's error: one of the boards found in addition is another one
 LOST = 2.0  # px: the most that one rim can say against a lens
+TINY = 1e-6  # of a numerical derivative by a pose or a number of the lens
 HALVINGS = 6  # of a step whose lens folds
 NOISE = 0.3  # px, of a rim, against the priors
 
@@ -48,8 +49,16 @@ class LensRefused(QualityError):  # noqa: N818  a gate's answer is a refusal, no
 class BoardSeen:
     """Rims of one view."""
 
-    pixels: Float64  #: (N, 2) rims of the board, image as it was taken
+    pixels: Float64  #: (N, 2) rims or corners of the board, image as it was taken
     T_camera_board: Float64  #: (4, 4) first guess
+    at: Float64 | None = (
+        None  #: (N, 2) where on the board's front they are, metres: corners of a pattern; None: on an edge
+    )
+
+    def thinned(self) -> BoardSeen:
+        """Leave out rims that repeat the rest."""
+        step = slice(None, None, max(1, len(self.pixels) // FEW))
+        return replace(self, pixels=self.pixels[step], at=None if self.at is None else self.at[step])
 
 
 Look = Callable[
@@ -124,7 +133,7 @@ def fit_lens_to_board(model: Model, views: Sequence[BoardSeen], camera: Camera) 
             f"lens: expected at least {MIN_VIEWS} views with the board, got {len(views)}",
             hint="record the board tilted 20 to 40 degrees in all directions, also in the corners of the image",
         )
-    thin = [replace(v, pixels=v.pixels[:: max(1, len(v.pixels) // FEW)]) for v in views]
+    thin = [v.thinned() for v in views]
     best, at = None, _Guess(camera, 0.0, tuple(v.T_camera_board for v in thin))
     for name, free in MODELS.items():
         found, there = _fit(model, thin, _saturating(at) if free == LENS else at, camera, name, free)
@@ -183,7 +192,8 @@ def _fit(
     away = lens_values(guess.camera) - begin
     without = np.stack([_solve([e for e in equations if e is not own], away, free) for own in equations])
     n = len(equations)
-    spread = (n - 1) / n * (without - without.mean(axis=0)).T @ (without - without.mean(axis=0))
+    few = (n - 1) / max(n - 3, 1)  # Student's t has that variance
+    spread = few * (n - 1) / n * (without - without.mean(axis=0)).T @ (without - without.mean(axis=0))
     pixels = np.concatenate([v.pixels for v in views])
     fitted = BoardLens(
         camera=guess.camera,
@@ -207,6 +217,10 @@ def _weighed(equations: Sequence[_Equations], scale: float) -> list[_Equations]:
 
 def _equations(model: Model, view: BoardSeen, T: Float64, guess: _Guess) -> _Equations:
     camera = guess.camera
+    if view.at is not None:
+        return _corner_equations(
+            np.column_stack([view.at, np.full(len(view.at), model.board.thickness)]), view, T, guess
+        )
     rays = camera.rays_at(view.pixels)
     xy = on_front(T, model.board, rays)
     edges = model.edges(xy)
@@ -241,6 +255,23 @@ def _ray_derivatives(camera: Camera, rays: Float64) -> Float64:
     moved = np.stack([goal * wide, goal * high, middle * wide, middle * high, k[0], k[1], p1, p2, *k[2:]])
     inverse = np.linalg.pinv(distortion_jacobian(xy, c))  # where the image nearly folds it has no inverse
     return np.pad(-np.einsum("nij,knj->kni", inverse, moved), ((0, 0), (0, 0), (0, 1)))
+
+
+def _corner_equations(at: Float64, view: BoardSeen, T: Float64, guess: _Guess) -> _Equations:
+    """Equations of corners (N, 3), board frame, seen at known pixels: both coordinates of each."""
+    camera, values = guess.camera, lens_values(guess.camera)
+
+    def off(camera: Camera, T: Float64) -> Float64:
+        return (camera.project(transform_points(T, at))[0] - view.pixels).reshape(-1)
+
+    residual, turns = off(camera, T), TINY * np.eye(6)
+    own = np.stack([(off(camera, exp(turn) @ T) - residual) / TINY for turn in turns], axis=1)
+    changed = [_camera(values + TINY * row, camera) for row in np.eye(LENS)]
+    by_lens = [(off(c, T) - residual) / TINY for c in changed]
+    shared = np.column_stack([*by_lens, np.zeros(len(residual))])
+    good = np.isfinite(np.column_stack([residual, own, shared])).all(axis=1)
+    known = (np.where(np.isfinite(x), x, 0.0) for x in (shared, own, residual))
+    return _Equations(*known, good.astype(np.float64), good)
 
 
 def _solve(equations: Sequence[_Equations], away: Float64, free: int) -> Float64:

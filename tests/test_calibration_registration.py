@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from calibration.registration.gate import (
     measure_registration,
     register,
 )
+from calibration.registration.search import Sights
 from tofcapture import poses
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.libraries import load_open3d
@@ -150,6 +152,77 @@ def test_unknown_backend_is_named_with_the_known_ones():
     """A typo answers with the list of names."""
     with pytest.raises(ConfigError, match="open3d, kiss-icp"):
         backend_named("kissicp")
+
+
+def plate(rng, noise=0.001):
+    """Plate of a third of a metre with one corner cut off, 0.7 m away, before a wall: the target, and what a camera at TRUE sees."""
+
+    def whole(step):
+        front = plane(
+            np.array([-0.18, -0.12, 0.7]), np.array([0.36, 0.0, 0.05]), np.array([0.0, 0.24, 0.03]), step
+        )
+        cut = (front.points[:, 0] > 0.06) & (front.points[:, 1] > 0.02)
+        return Cloud(front.points[~cut], front.normals[~cut])
+
+    front = whole(0.003)
+    wall = plane(np.array([-0.6, -0.5, 1.1]), np.array([1.2, 0.0, 0.1]), np.array([0.0, 1.0, 0.0]), 0.006)
+    rays = front.points / front.points[:, 2:]
+    shadow = np.zeros((400, 400), dtype=bool)
+    shadow[tuple(((rays[:, :2] + 1) * 200).astype(int).T)] = True
+    hidden = shadow[tuple(((wall.points[:, :2] / wall.points[:, 2:] + 1) * 200).astype(int).T)]
+    target = front + Cloud(wall.points[~hidden], wall.normals[~hidden])
+    return target, seen(whole(0.005), rng, noise, step=1)
+
+
+@pytest.mark.parametrize("degrees", [75, 180])
+def test_a_turned_board_is_never_believed(degrees):
+    """From guesses far off, about the direction in which the cameras look, half of a board fits: refused, whatever the library says."""
+    target, source = plate(np.random.default_rng(1))
+    middle = poses.transform_points(TRUE, source).mean(axis=0)
+    R = poses.rotation_exp(np.radians(degrees) * middle / np.linalg.norm(middle))
+    guess = poses.transform(R, middle - R @ middle) @ TRUE
+    result = register("open3d", source, target, guess)
+    assert check_registration(result, source, target, guess) is not None
+
+
+def test_a_turned_answer_contradicts_free_space():
+    """A plate laid into its own outline the wrong way round stands where the other camera saw the wall."""
+    target, source = plate(np.random.default_rng(2))
+    sights = Sights(source, target)
+    middle = poses.transform_points(TRUE, source).mean(axis=0)
+    R = poses.rotation_exp(np.pi * middle / np.linalg.norm(middle))
+    assert sights.agreement(TRUE).share > 0.99
+    assert sights.agreement(poses.transform(R, middle - R @ middle) @ TRUE).share < 0.95
+
+
+@pytest.mark.parametrize("scene", ["corner", "plate"])
+def test_a_start_is_found_without_a_guess(scene):
+    """A corner's three planes, and a cut plate before a wall, tell where the cameras stand to each other by themselves."""
+    rng = np.random.default_rng(3)
+    target, source = plate(rng) if scene == "plate" else (corner(0.004), seen(corner(0.004), rng))
+    found, clear = Sights(source, target).located()
+    assert clear
+    assert poses.rotation_angle(poses.invert(TRUE) @ found) < np.radians(3)
+    if scene == "corner":  # rims, which hold a board in its plane, are not among these points
+        result = register("open3d", source, target, None)
+        assert check_registration(result, source, target, None) is None
+        assert max(errors(result.T_target_source)) < 1
+
+
+def test_nothing_to_find_is_not_clear():
+    """A lone wall has no best place: without a guess it is refused."""
+    wall = plane(np.array([-0.3, -0.25, 0.8]), np.array([0.6, 0, 0.1]), np.array([0, 0.5, 0.1]), 0.006)
+    source = seen(wall, np.random.default_rng(0))
+    result = register("open3d", source, wall, None)
+    assert check_registration(result, source, wall, None) is not None
+
+
+def test_registration_from_a_hopeless_guess_is_short():
+    """Where the guess is hopeless the libraries are not asked: seconds, not a minute."""
+    target, source = plate(np.random.default_rng(4))
+    began = time.process_time()
+    register("small-gicp", source, target, poses.transform(poses.rotation_exp([1.5, 0, 0]), [0, 0, 0.3]))
+    assert time.process_time() - began < 15
 
 
 @pytest.mark.realdata

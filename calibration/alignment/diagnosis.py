@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from calibration.alignment.rounds import RefusedPairsError
+from calibration.alignment.rounds import RefusedPairsError, find_start
 from calibration.registration.clouds import WORKING_DEPTH, Cloud
 from calibration.registration.gate import Refusal, check_registration, register
 from calibration.registration.pairs import Pair
@@ -19,7 +20,7 @@ from tofcapture.errors import ConfigError, DataError, QualityError, TofError
 from tofcapture.files.view import read_view
 from tofcapture.frames import View
 from tofcapture.pool import Pool
-from tofcapture.poses import Float64, invert
+from tofcapture.poses import Float64, invert, rotation_angle
 
 APART = 1.0  # m between two cameras on one bracket; a rig in millimetres is far beyond
 MILLIMETRES = 50.0  # m; no calibration board stands there
@@ -31,6 +32,8 @@ CAUSES = {
     Refusal.NO_OVERLAP: "the cameras did not look at the same board at the same time, or the initial guess is far off",
     Refusal.PLANAR: "no rims in sight: use a board with cut-outs, 4 cm or more in front of what is behind it",
     Refusal.DIVERGED: "the initial guess is far off, or ToF and stereo images come from different views or different boards",
+    Refusal.CONTRADICTED: "the initial guess is far off, the board looks alike when turned, or it moved between the two cameras",
+    Refusal.UNCLEAR: "the initial guess is far off, or the board looks alike when turned",
     Refusal.NOT_CONVERGED: _MIXED,
     Refusal.POOR_FIT: _MIXED,
 }
@@ -83,8 +86,23 @@ def explained(
                     f"{error.message}; with {axis} of the stereo points turned round the views fit",
                     hint=f"the stereo driver's {axis} axis is mirrored: expected x right, y down, z forward",
                 )
+        off = _free_start(pool, full, T_tof_stereo)
+    if off:
+        return QualityError(error.message, hint=off)
     common = Counter(r for r in error.refusals if r is not None).most_common(1)
     return QualityError(error.message, hint=f"likely cause: {CAUSES[common[0][0]]}") if common else error
+
+
+def _free_start(pool: Pool, pairs: Sequence[Pair], T_tof_stereo: Float64) -> str:
+    """Say how far the initial guess is from where the views fit without it; empty where they do not."""
+    with suppress(QualityError):
+        moved = find_start(pairs, pool) @ T_tof_stereo
+        turned, shift = np.degrees(rotation_angle(moved)), 1e3 * np.linalg.norm(moved[:3, 3])
+        return (
+            f"likely cause: the initial guess is far off. Without one the views fit {turned:.0f} degrees and {shift:.0f} mm away "
+            "from it: --initial none"
+        )
+    return ""
 
 
 def unusable(view: View, name: str) -> DataError | None:

@@ -21,12 +21,14 @@ from calibration.registration.gate import (
     FINE,
     Refusal,
     Registration,
+    check_clouds,
     check_registration,
     register,
     residuals,
     tukey_weights,
 )
 from calibration.registration.pairs import Pair
+from calibration.registration.search import clear_answer, same_answer
 from tofcapture.camera import Camera
 from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.errors import QualityError, TofError
@@ -64,6 +66,26 @@ def _range_and_radius(points: Float64, camera: Camera) -> tuple[Float64, Float64
     """Ranges (N,) of points (N, 3), metres, and their pixels' distances (N,) to the principal point."""
     radius = np.linalg.norm(points[:, :2] / points[:, 2:] * [camera.fx, camera.fy], axis=-1)
     return np.linalg.norm(points, axis=-1), radius
+
+
+def find_start(pairs: Sequence[Pair], pool: Pool) -> Float64:
+    """Find ``T_stereo_tof`` (4, 4) without a guess: what two views, each clear by itself, say alike.
+
+    :class:`QualityError` where no two do.
+    """
+    found: list[Float64] = []
+    for pair in pairs:
+        if (
+            check_clouds(pair.source, pair.target) is None
+            and (T := pool.call(clear_answer, pair.source, pair.target)) is not None
+        ):
+            if any(same_answer(T, other) for other in found):
+                return T
+            found.append(T)
+    raise QualityError(
+        f"no start without a guess: of {len(pairs)} views {len(found)} tell one answer by themselves, and no two the same",
+        hint="pass --initial rig.toml with the bracket's drawing, good to 5 degrees and 5 cm",
+    )
 
 
 @dataclass(frozen=True)

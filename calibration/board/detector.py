@@ -126,7 +126,7 @@ def detect(sight: Sight, board: Board, camera: Camera) -> Detection:
         if any(d.certain for d, _ in found):
             break
     if not found:
-        raise _refused(BoardRefusal.NO_PLANE, board, f"no plane with {MIN_RIMS} rims on it")
+        raise refused(BoardRefusal.NO_PLANE, board, f"no plane with {MIN_RIMS} rims on it")
     found.sort(key=lambda item: -item[0].score)
     first, on_plane = found[0]
     best = _explained(model, on_plane, refine(model, on_plane, first.T_camera_board), camera)
@@ -135,7 +135,7 @@ def detect(sight: Sight, board: Board, camera: Camera) -> Detection:
         metres, radians = _distance(best.T_camera_board, rival.T_camera_board, np.array([*board.middle, 0.0]))
         if (metres > APART[0] or radians > APART[1]) and rival.score > RIVAL * first.score:
             detail = f"another pose, {np.degrees(radians):.0f} deg away, fits as well"
-            raise _refused(BoardRefusal.AMBIGUOUS, board, detail)
+            raise refused(BoardRefusal.AMBIGUOUS, board, detail)
     return best
 
 
@@ -292,7 +292,7 @@ def _check(model: Model, sight: Sight, found: Detection) -> None:
     # Rims well inside the outline, wherever the model has its holes.
     inner = int((inside(board.outline, xy) & (distance_to_ring(board.outline, xy) > 0.012)).sum())
     if inner < MIN_RIMS / 3 or not found.holes:
-        raise _refused(BoardRefusal.NO_HOLES, board, f"{inner} rims inside its outline")
+        raise refused(BoardRefusal.NO_HOLES, board, f"{inner} rims inside its outline")
     missing = [name for name, share in found.holes.items() if share < FOUND]
     wrong = ""
     if len(missing) > (1 - HOLES) * len(found.holes):
@@ -302,8 +302,9 @@ def _check(model: Model, sight: Sight, found: Detection) -> None:
     elif found.contradicted > CONTRADICTED:
         wrong = f"{100 * found.contradicted:.0f} % of the surface lies where it has a hole or ends"
     if wrong:
-        raise _refused(BoardRefusal.WRONG_BOARD, board, wrong)
+        raise refused(BoardRefusal.WRONG_BOARD, board, wrong)
 
 
-def _refused(why: BoardRefusal, board: Board, detail: str) -> QualityError:
+def refused(why: BoardRefusal, board: Board, detail: str) -> QualityError:
+    """Say why no pose is reported."""
     return QualityError(f"board {board.name!r}: {why} ({detail})", hint=HINTS[why])

@@ -151,6 +151,8 @@ class Sight:
     surface: Float64  #: (M, 3) surface points, camera frame, metres
     sigma: float  #: Noise of a surface point with the bias of its neighbourhood, metres
     bias_sigma: float  #: What a common range error may be, metres
+    at: Float64 | None = None  #: (N, 2) where on the board the rims are known to be: corners of a pattern
+    edge_sigma: float = RIM_SIGMA  #: Of a rim or corner on the board, metres
 
 
 @dataclass(frozen=True)
@@ -188,14 +190,19 @@ def _equations(
     """Jacobian (K, 8), residuals, weights and clusters (K,), rims first."""
     board, n = model.board, T[:3, 2]
     xy = on_front(T, board, sight.rims)
-    found = model.edges(xy)
+    if sight.at is None:
+        found = model.edges(xy)
+        gradient, r_rim, grows = found.gradient, found.distance - nuisance[1], -1.0
+        w_rim = tukey_weights(r_rim, scale) * clear_of_walls(T, board, xy, found.outward)
+        sides = np.where(found.ring == 0, found.segment, 1000 + found.ring)
+    else:  # both coordinates of every corner
+        gradient, r_rim, grows = np.tile(np.eye(2), (len(xy), 1)), (xy - sight.at).reshape(-1), 0.0
+        w_rim, xy, sides = tukey_weights(r_rim, scale), np.repeat(xy, 2, axis=0), np.arange(2 * len(xy)) // 2
     X = transform_points(T, np.column_stack([xy, np.full(len(xy), board.thickness)]))
-    g = found.gradient @ T[:3, :2].T
+    g = gradient @ T[:3, :2].T
     a = n * ((g * X).sum(axis=1) / (X @ n))[:, None] - g
-    J_rim = np.column_stack([a, np.cross(X, a), np.zeros(len(a)), -np.ones(len(a))])
-    r_rim = found.distance - nuisance[1]
-    w_rim = tukey_weights(r_rim, scale) / RIM_SIGMA**2 * clear_of_walls(T, board, xy, found.outward)
-    sides = np.where(found.ring == 0, found.segment, 1000 + found.ring)
+    J_rim = np.column_stack([a, np.cross(X, a), np.zeros(len(a)), np.full(len(a), grows)])
+    w_rim = w_rim / sight.edge_sigma**2
 
     away = sight.surface / np.linalg.norm(sight.surface, axis=1, keepdims=True)
     P = sight.surface - nuisance[0] * away

@@ -1,4 +1,4 @@
-"""Boards with cut-outs as data: outline, thickness and holes, read from TOML and checked by name.
+"""Boards as data: outline, thickness, cut-outs and what is printed on the front, read from TOML and checked by name.
 
 The board's frame has its origin in the plane of the back face, x and y as in the file, z towards the front face, which lies at
 z = thickness.
@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from tofcapture.errors import ConfigError
-from tofcapture.meshes import circle, inside, signed_area
+from tofcapture.meshes import circle, inside, rectangle, signed_area
+from tofcapture.pattern import KINDS, Pattern, pattern_from
 from tofcapture.poses import Float64
 
 BOARDS = Path(__file__).with_name("boards")
@@ -24,6 +25,8 @@ DEFAULT = "default"
 SIZES = (0.05, 3.0)  # m; an outline beyond these was written in other units
 MIN_WEB = 0.005  # m of material between cut-outs: less breaks, and hides from a ToF pixel
 SEGMENTS = 64  # facets of a circle where the file does not say
+EDGE = 0.5  # squares of plate around a pattern where the file gives no outline
+FILE = {"format": "tofcapture-board", "version": 1, "units": "m", "thickness": 0.005}
 SAME = 0.0015  # m; symmetric to less than this looks symmetric to a camera
 
 
@@ -46,6 +49,7 @@ class Board:
     outline: Float64  #: (N, 2) float64 simple polygon, metres, counter-clockwise
     thickness: float  #: Metres
     holes: tuple[Hole, ...]  #: In the order of the file
+    pattern: Pattern | None = None  #: What is printed on the front, in the middle of the board's frame
 
     @property
     def rings(self) -> list[Float64]:
@@ -60,14 +64,19 @@ class Board:
 
 
 def load_board(board: str | Path = DEFAULT) -> Board:
-    """Read a board: a TOML file, or a packaged one by name (``default``, ``second``).
+    """Read a board: a TOML file, a packaged one by name, Kalibr's YAML, or words such as ``charuco:7x5:0.07:0.05:DICT_4X4_50``.
 
-    :class:`ConfigError` where it is missing, not TOML, or not a board; the message names the hole.
+    The words are kind, columns x rows, square, marker and dictionary. :class:`ConfigError` where it is missing, not TOML, or not a board; the message names the hole.
     """
     packaged = {p.stem: p for p in sorted(BOARDS.glob("*.toml"))}
     path = packaged.get(str(board), Path(board))
+    if ":" in str(board) and str(board).split(":")[0] in KINDS:
+        return board_from({**FILE, "pattern": _in_words(str(board))}, str(board))
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if path.suffix in {".yaml", ".yml"}:
+            return board_from({**FILE, "pattern": _kalibr(text, path)}, str(path))
+        table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as err:
         raise ConfigError(f"{path}: not TOML: {err}") from err
     except (OSError, UnicodeDecodeError) as err:
@@ -77,13 +86,55 @@ def load_board(board: str | Path = DEFAULT) -> Board:
     return board_from(table, str(path))
 
 
+def _in_words(words: str) -> dict[str, Any]:
+    """Read a pattern from ``kind:columns x rows:square[:marker[:dictionary]]``."""
+    kind, *rest = words.split(":")
+    try:
+        columns, rows = (int(n) for n in rest[0].lower().split("x"))
+        lengths = dict(zip(("square", "marker"), map(float, rest[1:3]), strict=False))
+    except (IndexError, ValueError) as err:
+        raise ConfigError(
+            f"board {words!r}: expected kind:COLUMNSxROWS:SQUARE[:MARKER[:DICTIONARY]], lengths in metres",
+            hint="such as charuco:7x5:0.07:0.05:DICT_4X4_50; columns and rows count squares, of an AprilGrid tags",
+        ) from err
+    return {
+        "kind": kind,
+        "columns": columns,
+        "rows": rows,
+        **lengths,
+        **({"dictionary": rest[3]} if rest[3:] else {}),
+    }
+
+
+def _kalibr(text: str, path: Path) -> dict[str, Any]:
+    """Read a pattern from a target file of Kalibr."""
+    import yaml
+
+    try:
+        found = dict(yaml.safe_load(text))
+        if found["target_type"] == "checkerboard":
+            count = {"columns": int(found["targetCols"]) + 1, "rows": int(found["targetRows"]) + 1}
+            return {"kind": "chessboard", **count, "square": float(found["colSpacingMeters"])}
+        tag, spacing = float(found["tagSize"]), float(found["tagSpacing"])
+        count = {"columns": int(found["tagCols"]), "rows": int(found["tagRows"])}
+        return {
+            "kind": str(found["target_type"]),
+            **count,
+            "square": tag * (1 + spacing),
+            "marker": tag,
+            "border": 2,
+        }
+    except (yaml.YAMLError, KeyError, TypeError, ValueError) as err:
+        raise ConfigError(f"{path}: expected a target of Kalibr, aprilgrid or checkerboard: {err!r}") from err
+
+
 def board_from(table: Mapping[str, Any], where: str = "board") -> Board:
     """Read a board from plain TOML types and check it.
 
     :class:`ConfigError` for wrong format, units or keys, and for polygons that cross themselves or each other, leave the outline, or
     leave too little material.
     """
-    _known(table, {"format", "version", "units", "name", "thickness", "outline", "hole"}, where)
+    _known(table, {"format", "version", "units", "name", "thickness", "outline", "hole", "pattern"}, where)
     if table.get("format") != "tofcapture-board" or table.get("version") != 1:
         raise ConfigError(
             f"{where}: expected format tofcapture-board, version 1, got {table.get('format')!r}, {table.get('version')!r}",
@@ -92,9 +143,15 @@ def board_from(table: Mapping[str, Any], where: str = "board") -> Board:
     if table.get("units") != "m":
         raise ConfigError(f'{where}: expected units = "m", got {table.get("units")!r}')
     holes = tuple(_hole(t, f"{where}: hole {i + 1}") for i, t in enumerate(table.get("hole", [])))
-    outline = _polygon(table.get("outline"), f"{where}: outline")
+    pattern = pattern_from(table["pattern"], f"{where}: pattern") if "pattern" in table else None
+    around = None if pattern is None else rectangle(*(pattern.size + 2 * EDGE * pattern.square))
+    outline = _polygon(table.get("outline", around), f"{where}: outline")
     thickness = _length(table, "thickness", f"{where}: thickness")
-    board = Board(str(table.get("name", where)), outline, thickness, holes)
+    board = Board(str(table.get("name", where)), outline, thickness, holes, pattern)
+    if pattern is not None and not inside(outline, rectangle(*pattern.size)).all():
+        raise ConfigError(
+            f"{where}: pattern: expected inside the outline, got {pattern.size.round(4).tolist()} m"
+        )
     _check_cuttable(board, where)
     return board
 

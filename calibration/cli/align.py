@@ -35,7 +35,16 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         help="averaged as in the paper, weighted by information, or joint with range errors (default: averaged)",
     )
     parser.add_argument(
-        "--initial", type=Path, metavar="RIG.toml", help="start from this rig, not from the views' own"
+        "--scene",
+        default="calibration",
+        metavar="NAME",
+        help="views of this scene instead of the board's: objects of enough relief, best with --method joint",
+    )
+    parser.add_argument(
+        "--initial",
+        type=Path,
+        metavar="RIG.toml|none",
+        help="start from this rig, not from the views' own; none: without a guess",
     )
     parser.add_argument(
         "--compare", type=Path, metavar="RIG.toml", help="say how far the cameras moved since this rig"
@@ -47,11 +56,12 @@ def _run(args: argparse.Namespace) -> Outcome:
     from calibration.evidence import drift, drift_table, drift_text, load_old
     from tofcapture.rig import load_rig, rig_to_dict
 
-    initial = None if args.initial is None else load_rig(args.initial)
+    free = str(args.initial) == "none"
+    initial = "none" if free else None if args.initial is None else load_rig(args.initial)
     old = None if args.compare is None else load_old(args.compare)  # before align replaces rig.toml
     with kit.progress() as progress:
         out = args.out or args.recording
-        rig, evidence = align(args.recording, args.backend, initial, progress, args.method, out)
+        rig, evidence = align(args.recording, args.backend, initial, progress, args.method, out, args.scene)
         page, absent = _page(args.recording, out, old, evidence, progress)
     paths = {"rig": str(out / "rig.toml"), "evidence": str(out / "evidence.json")}
     moved = None if old is None else drift(evidence, old)

@@ -56,6 +56,11 @@ def configure_hand_eye(parser: argparse.ArgumentParser) -> None:
         metavar="SIDE=WORDS",
         help="how numbers are meant, where files do not say: hand=ZYX,deg or target=wxyz,mm or both=cm",
     )
+    parser.add_argument(
+        "--board",
+        metavar="BOARD",
+        help="of a recording: the ToF camera's poses of this board, packaged or a TOML file (default: the stereo camera's clouds)",
+    )
     parser.add_argument("--out", type=Path, metavar="RESULT.json", help="write the result here")
 
 
@@ -96,6 +101,9 @@ def _pairs(args: argparse.Namespace) -> tuple[Float64, Float64, dict[str, Any]]:
     from calibration.hand_eye.readings import agreed
 
     paths = args.inputs
+    if len(paths) == 1 and paths[0].is_dir() and args.board:
+        hand, target, refused = _board_pairs(paths[0], args.board)
+        return hand, _turned(target, args), {"camera": "tof", "refused": refused}, None
     if len(paths) == 1 and paths[0].is_dir():
         with kit.progress() as progress:
             hand, target = recording_pairs(paths[0], progress)
@@ -131,6 +139,27 @@ def _read_as(args: argparse.Namespace, side: str) -> list[str]:
             raise UsageError(f"--read-as: expected hand=..., target=... or both=..., got {given!r}")
         words += what.split(",") if who in {side, "both"} else []
     return words
+
+
+def _board_pairs(recording: Path, name: str) -> tuple[Float64, Float64, list[str]]:
+    """Poses of the hand, and of a board in the ToF camera, of a recording's views; and why others have none."""
+    from calibration.board.geometry import load_board
+    from calibration.board.seen import must_be_unique, seen_by_tof
+
+    board = load_board(name)
+    must_be_unique(board)
+    hand, target, refused = [], [], []
+    for path, view in read_views(recording, "board"):
+        try:
+            target.append(seen_by_tof(view.tof, board, view.tof.info.camera).fit.T)
+            hand.append(view.arm_before.T_base_flange)
+        except QualityError as err:
+            refused.append(f"{path.stem} {err}")
+    if len(hand) < 3:
+        raise QualityError(
+            f"{recording}: expected the board in at least 3 views, got {len(hand)}: {'; '.join(refused)}"
+        )
+    return np.stack(hand), np.stack(target), refused
 
 
 def _turned(target: Float64, args: argparse.Namespace) -> Float64:
@@ -216,16 +245,18 @@ def run_bundle(args: argparse.Namespace) -> Outcome:
 
 def _fits_of(view: View, index: int, board: Board) -> tuple[list[BoardFit], list[str]]:
     """Board fits of both cameras in a view, and why a camera has none."""
-    from calibration.board.detector import detect, stereo_sight, tof_sight
+    from calibration.board.seen import must_be_unique, seen_by_stereo, seen_by_tof
     from calibration.bundle import CAMERAS, BoardFit
 
-    fits, refused = [], []
+    must_be_unique(board)
+    fits, refused, start = [], [], None
     for camera in CAMERAS:
         try:
             if camera == "tof":
-                found = detect(tof_sight(view.tof), board, view.tof.info.camera).fit
+                found = seen_by_tof(view.tof, board, view.tof.info.camera).fit
+                start = view.rig.T_stereo_tof @ found.T
             else:
-                found = detect(stereo_sight(view.stereo), board, view.stereo.info.camera).fit
+                found = seen_by_stereo(view.stereo, board, start)
         except QualityError as err:
             refused.append(f"{camera}: {err}")
         else:

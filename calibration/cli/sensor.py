@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from tofcapture.rig import Rig
 
 CARELESS = 3.0  # times: an averaged alignment's error is mostly the range error itself, which its scatter does not show
+IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp"}
 
 
 def read_views(recording: Path, what: str) -> Iterator[tuple[Path, View]]:
@@ -90,14 +91,17 @@ def configure_lens(parser: argparse.ArgumentParser) -> None:
 
 
 def run_lens(args: argparse.Namespace) -> Outcome:
-    """Fit the lens, or read the maker's; write it into ``rig.toml`` and ``lens.json``."""
+    """Fit the lens of a recording's ToF camera into ``rig.toml`` and ``lens.json``, that of a folder of images into ``lens.json``."""
     if args.factory:
         return _factory_lens(args)
     from calibration.board.fit import Model
     from calibration.board.geometry import load_board
     from calibration.lens import fit_lens
 
-    board, rig = load_board(args.board), believed_rig(args.recording)
+    board = load_board(args.board)
+    if images := _images(args.recording):
+        return _lens_of_images(args, board, images)
+    rig = believed_rig(args.recording)
 
     def look(camera: Camera) -> tuple[list[BoardSeen], list[str]]:
         found, refused = [], []
@@ -109,7 +113,7 @@ def run_lens(args: argparse.Namespace) -> Outcome:
         return found, refused
 
     fit, refused = fit_lens(Model(board), look, rig.tof)
-    data = {**lens_report(fit, rig), "refused": refused}
+    data = {**lens_report(fit, rig.tof), "refused": refused}
     return saved(args, "lens.json", data, replace(rig, tof=fit.camera), lens_table(data))
 
 
@@ -130,18 +134,43 @@ def _factory_lens(args: argparse.Namespace) -> Outcome:
     return saved(args, "lens.json", data, replace(rig, tof=camera), text)
 
 
+def _images(folder: Path) -> list[Path]:
+    if not folder.is_dir() or (folder / "views").exists():
+        return []
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGES)
+
+
+def _lens_of_images(args: argparse.Namespace, board: Board, paths: list[Path]) -> Outcome:
+    """Fit the lens of the camera that took these images of a printed board."""
+    from calibration.board.fit import Model
+    from calibration.board.printed import printed_pose, read_corners, start_camera
+    from calibration.lens import BoardSeen, fit_lens_to_board
+    from calibration.limits import worst
+    from tofcapture.rig import camera_table
+
+    with kit.progress() as progress:
+        size, seen, refused = read_corners(paths, board, progress)
+    start = start_camera(list(seen.values()), size)
+    views = [BoardSeen(pixels, printed_pose(pixels, at, board, start), at) for pixels, at in seen.values()]
+    fit = fit_lens_to_board(Model(board), views, start)
+    data = {**lens_report(fit, start), "images": [p.name for p in seen], "refused": refused}
+    data["look"] = [text for text in data["look"] if "rig transform" not in text]
+    data |= {"camera": camera_table(fit.camera), "verdict": worst(list(data["verdicts"].values()))}
+    if args.dry_run:
+        return Outcome(data, lens_table(data))
+    return kit.written(data, lens_table(data), args.recording / "lens.json")
+
+
 def board_seen(view: View, camera: Camera, board: Board) -> BoardSeen:
-    """Find the board with the believed lens, or say why not; keep its rims as pixels, which no lens has touched."""
-    from calibration.board.detector import NEAR_PLANE, detect, tof_sight
+    """Find the board with the believed lens, or say why not; keep its rims or corners as pixels, which no lens has touched."""
+    from calibration.board.seen import seen_by_tof
     from calibration.lens import BoardSeen
 
-    sight = tof_sight(replace(view.tof, info=replace(view.tof.info, camera=camera)))
-    T = detect(sight, board, camera).T_camera_board
-    height = (sight.rims - T[:3, 3]) @ T[:3, 2]
-    return BoardSeen(camera.project(sight.rims[np.abs(height) < NEAR_PLANE])[0], T)
+    found = seen_by_tof(view.tof, board, camera)
+    return BoardSeen(found.pixels, found.fit.T, found.at)
 
 
-def lens_report(fit: BoardLens, rig: Rig) -> dict[str, Any]:
+def lens_report(fit: BoardLens, before: Camera) -> dict[str, Any]:
     """Lay a fit out as JSON types."""
     from calibration.lens import NAMES, lens_values
     from calibration.limits import LENS, worst
@@ -153,7 +182,7 @@ def lens_report(fit: BoardLens, rig: Rig) -> dict[str, Any]:
         "coverage": float(fit.coverage.min()),
     }
     verdicts = {k: LENS[k].verdict(v) for k, v in judged.items()}
-    values = zip(NAMES, lens_values(fit.camera), fit.sigma, lens_values(rig.tof), strict=True)
+    values = zip(NAMES, lens_values(fit.camera), fit.sigma, lens_values(before), strict=True)
     return {
         "format": "tofcapture-lens-calibration",
         "version": 1,

@@ -10,7 +10,7 @@ times as accurate as the other way round, because its normals are good.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from importlib import import_module
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.registration.clouds import Cloud
+from calibration.registration.search import Sights
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.libraries import load_open3d
 from tofcapture.poses import Float64, invert, rotation_angle, transform_points
@@ -31,6 +32,7 @@ MAX_ROTATION = np.radians(10.0)  # from the initial guess, which a bracket's dra
 MAX_TRANSLATION = 0.10  # m, from the initial guess, at the points
 MAX_STEP_ROTATION = np.radians(0.5)  # one more Newton step of a converged result is far smaller
 MAX_STEP_TRANSLATION = 0.003  # m
+MIN_AGREEMENT = 0.95  # share of what both cameras have seen that free space allows; true answers reach 0.98, half turns 0.94
 MAX_RMSE = 0.005  # m; below the 5.8 mm of residuals spread evenly over the inlier distance
 
 
@@ -41,6 +43,8 @@ class Refusal(StrEnum):
     NO_OVERLAP = "no overlap"
     PLANAR = "planar-degenerate"
     DIVERGED = "diverged"
+    CONTRADICTED = "contradicts free space"
+    UNCLEAR = "not clearly the best"
     NOT_CONVERGED = "did not converge"
     POOR_FIT = "poor fit"
 
@@ -64,6 +68,10 @@ class Registration:
     #: (6,) Newton step that is left at this result: (translation of ``centre``, rotation vector),
     #: metres and radians
     step: Float64
+    agreement: float = 1.0  #: Share of what both cameras have seen that free space allows
+    clear: bool = (
+        True  #: False where another answer fits as well or better, or none was found without a guess
+    )
 
 
 @dataclass(frozen=True)
@@ -136,7 +144,10 @@ def measure_registration(T_target_source: Float64, source: Float64, target: Clou
     condition = float(eigenvalues[-1] / eigenvalues[0]) if eigenvalues[0] > 1e-15 else np.inf
     step = -np.linalg.pinv((J * weights).T @ J) @ ((J * weights).T @ found.distance)
     information = J.T @ J / max(rmse, 1e-9) ** 2
-    return Registration(T_target_source, len(J), rmse, fitness, information, condition, centre, step)
+    agreement = Sights(source, target).agreement(T_target_source).share
+    return Registration(
+        T_target_source, len(J), rmse, fitness, information, condition, centre, step, agreement
+    )
 
 
 def _nothing(T: Float64, inliers: int, fitness: float) -> Registration:
@@ -144,12 +155,12 @@ def _nothing(T: Float64, inliers: int, fitness: float) -> Registration:
 
 
 def check_registration(
-    result: Registration, source: Float64, target: Cloud, initial: Float64
+    result: Registration, source: Float64, target: Cloud, initial: Float64 | None
 ) -> Refusal | None:
     """Gate a registration measured on these clouds.
 
-    ``initial`` (4, 4) is the ``T_target_source`` that the operator believes to about 2 degrees and 2 cm. The answer is the first
-    reason not to believe the result, None when it passes.
+    ``initial`` (4, 4) is the ``T_target_source`` that the operator believes to about 2 degrees and 2 cm, None where nothing is
+    believed. The answer is the first reason not to believe the result, None when it passes.
     """
     if check_clouds(source, target) is not None:
         return Refusal.EMPTY
@@ -157,14 +168,22 @@ def check_registration(
         return Refusal.NO_OVERLAP
     if result.condition > MAX_CONDITION:
         return Refusal.PLANAR
-    moved = result.T_target_source @ invert(initial)
-    shift = transform_points(moved, result.centre) - result.centre
-    if rotation_angle(moved) > MAX_ROTATION or np.linalg.norm(shift) > MAX_TRANSLATION:
+    if not result.clear:
+        return Refusal.UNCLEAR
+    if initial is not None and not _near(result.T_target_source, initial, result.centre):
         return Refusal.DIVERGED
+    if result.agreement < MIN_AGREEMENT:
+        return Refusal.CONTRADICTED
     left, turn = np.linalg.norm(result.step[:3]), np.linalg.norm(result.step[3:])
     if left > MAX_STEP_TRANSLATION or turn > MAX_STEP_ROTATION:
         return Refusal.NOT_CONVERGED
     return Refusal.POOR_FIT if result.rmse > MAX_RMSE else None
+
+
+def _near(T_target_source: Float64, initial: Float64, centre: Float64) -> bool:
+    moved = T_target_source @ invert(initial)
+    shift = transform_points(moved, centre) - centre
+    return bool(rotation_angle(moved) <= MAX_ROTATION and np.linalg.norm(shift) <= MAX_TRANSLATION)
 
 
 COARSE_TO_FINE = (0.080, 0.040, 0.020, 0.010)  # m, correspondence distances
@@ -180,24 +199,41 @@ def register(
     backend: str,
     source: Float64,
     target: Cloud,
-    initial: Float64,
+    initial: Float64 | None,
     distances: Sequence[float] = COARSE_TO_FINE,
 ) -> Registration:
     """Register by the backend of that name and measure the result with our own code.
 
     The source (N, 3), finite, source frame, metres, goes into the dense target from ``initial`` (4, 4), ``T_target_source``, and
     stays there where the clouds are empty. ``distances`` are correspondence distances, metres, descending, and the scale of a
-    robust kernel.
+    robust kernel. A library is asked only from where it can succeed: where a few coarse steps of our own from the guess end in a
+    contradiction, or there is no guess, the clouds are searched as a whole.
 
     :class:`ConfigError` for an unknown backend, or a library that is not installed. Open3D and kiss-icp sum in parallel: they are
     bit-reproducible only in a process that was held to one core before it loaded them, ``Pool(1, pinned=True)`` of
     :mod:`tofcapture.pool`.
     """
     method = backend_named(backend)
-    empty = check_clouds(source, target) is not None
-    return measure_registration(
-        initial if empty else method(source, target, initial, distances), source, target
-    )
+    if check_clouds(source, target) is not None:
+        return measure_registration(np.eye(4) if initial is None else initial, source, target)
+    start, clear = initial, True
+    if start is None or distances[0] > max(FINE):
+        start, distances, clear = _start(Sights(source, target), initial, distances)
+    answer = method(source, target, start, distances) if distances else start
+    return replace(measure_registration(answer, source, target), clear=clear)
+
+
+def _start(
+    sights: Sights, initial: Float64 | None, distances: Sequence[float]
+) -> tuple[Float64, Sequence[float], bool]:
+    """Choose where a library starts, its distances (none: it is not asked), and say whether no other start is as good."""
+    end = np.eye(4) if initial is None else sights.followed(initial)
+    if initial is not None and sights.agreement(end).share >= MIN_AGREEMENT and not sights.outdone(end):
+        return initial, distances, True
+    found = sights.located()
+    if found is None or not (found[1] or initial is None):
+        return end, (), False
+    return found[0], FINE, found[1]
 
 
 def backend_named(name: str) -> Backend:

@@ -7,6 +7,7 @@ numpy alone, for readers; :class:`PlaneField` is compiled, and lets every place 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,6 +25,9 @@ TOLERANCE = 2.0  # a window is flat while its residual is below this many times 
 TYPICAL = 4000  # windows, at least, whose median is taken
 GRAZING_COSINE = 0.25882  # cos 75 deg
 WITHIN = 4.0  # standard deviations by which a triangle may miss the plane through its surroundings
+GRID = 16  # pixels between the places where noise is estimated
+ABOUT = 2  # such places on every side that tell the noise of one
+QUIET = 30.0  # percentile of their residuals that is noise: edges are in fewer
 CELL = 2  # pixels: windows start and end at cells, a quarter of the table's memory and of its cache misses
 _MIN_SPREAD = 1e-4  # det / trace^2 of the window's rays; below, they are a line and the plane may swivel
 
@@ -78,7 +82,8 @@ class PlaneField:
     """Planes through a depth image wherever they are asked for, in windows as large as the surface is flat.
 
     Windows of several sizes are fitted at each place. The largest is taken whose residual is what noise leaves in such
-    windows (their median); beside creases that is a small one. The image's moments are summed once.
+    windows; beside creases that is a small one. What noise leaves is their median, and more where the smallest windows of the
+    neighbourhood, which hardly see curvature, say that it is noisier there. The image's moments are summed once.
 
     ``depth`` (H, W) is z in metres, NaN: none; ``camera`` holds the intrinsics of the image.
     """
@@ -106,11 +111,31 @@ class PlaneField:
         _residuals(self._sums, some, cells, _MIN_SPREAD, found)
         fits = [column[np.isfinite(column)] for column in found.T]
         limits = TOLERANCE * np.array([np.median(fit) if len(fit) else np.nan for fit in fits])
+        noise = self._noise(cells[:1]) / max(limits[0] / TOLERANCE, 1e-12)
+        place = np.minimum(
+            np.nan_to_num(pixels, nan=0.0).astype(np.intp) // GRID, np.array(noise.shape[::-1]) - 1
+        )
+        noisier = np.fmax(noise[place[:, 1], place[:, 0]], 1.0)
         chosen, residual = np.empty((len(pixels), 3)), np.empty(len(pixels))
         eye = self._camera
         rays = (pixels - [eye.cx, eye.cy]) / [eye.fx, eye.fy]
-        _choose(self._sums, pixels, cells, limits, _MIN_SPREAD, rays, chosen, residual)
+        _choose(self._sums, pixels, cells, limits, noisier, _MIN_SPREAD, rays, chosen, residual)
         return chosen, residual
+
+    def _noise(self, cells: NDArray[np.int64]) -> Float64:
+        """Estimate the noise of inverse depth every ``GRID`` pixels: what windows of so many cells leave about there."""
+        u, v = np.meshgrid(
+            np.arange(GRID // 2, self._camera.width, GRID), np.arange(GRID // 2, self._camera.height, GRID)
+        )
+        left = np.empty((u.size, 1))
+        _residuals(
+            self._sums, np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64), cells, _MIN_SPREAD, left
+        )
+        padded = np.pad(left.reshape(u.shape), ABOUT, constant_values=np.nan)
+        near = np.lib.stride_tricks.sliding_window_view(padded, (2 * ABOUT + 1, 2 * ABOUT + 1))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # nothing was measured there
+            return np.asarray(np.nanpercentile(near, QUIET, axis=(2, 3)))
 
     def smooth(
         self, depth: Float64, normals: Float64, pixels: Float64, camera: Camera, T_camera_own: Float64
@@ -209,10 +234,12 @@ def _residuals(
 
 @compiled
 def _choose(
-    sums: Float64, pixels: Float64, radii: NDArray[np.int64], limits: Float64, min_spread: float, rays: Float64,
-    chosen: Float64, residual: Float64,
+    sums: Float64, pixels: Float64, radii: NDArray[np.int64], limits: Float64, noisier: Float64, min_spread: float,
+    rays: Float64, chosen: Float64, residual: Float64,
 ) -> None:  # fmt: skip
     """Of every pixel's windows take the largest one's plane whose residual is within the limits, else the smallest one's.
+
+    The limits are ``noisier`` (n,) times wider at each pixel.
 
     A plane through a bent surface misses its middle by an amount that grows with the square of the window; two windows tell
     it, and the plane is moved to where it vanishes. ``rays`` (n, 2) are x and y at the pixels. ``residual`` (n,) is that of
@@ -228,7 +255,7 @@ def _choose(
             left = _fit_window(sums, u, v, radii[j], min_spread, window, large)
             if np.isfinite(left):  # the smallest such window stays where none is flat
                 chosen[i, :] = large
-            if not left <= limits[j]:
+            if not left <= limits[j] * noisier[i]:
                 continue
             residual[i] = left
             if j > 0 and np.isfinite(_fit_window(sums, u, v, radii[j - 1], min_spread, window, small)):

@@ -33,7 +33,9 @@ class SceneObject:
 
     vertices: Float64  #: (N, 3) float64, object frame, metres.
     triangles: Int64  #: (M, 3) indices into the vertices.
-    albedo: float  #: Diffuse reflectance at the illuminator's wavelength, in [0, 1].
+    albedo: (
+        float | Float64
+    )  #: Diffuse reflectance at the illuminator's wavelength, in [0, 1]; (M,) of each triangle.
     T_world_object: Float64  #: (4, 4).
     target: bool = True  #: True for the scene's object, False for table, walls and clutter.
     name: str = "object"  #: For messages.
@@ -47,7 +49,9 @@ class SceneObject:
             raise ConfigError(f"{self.name}: expected triangles (M, 3), got shape {self.triangles.shape}")
         if self.triangles.min() < 0 or self.triangles.max() >= len(self.vertices):
             raise ConfigError(f"{self.name}: a triangle names a vertex that does not exist")
-        if not 0.0 <= self.albedo <= 1.0:
+        if np.shape(self.albedo) not in {(), (len(self.triangles),)}:
+            raise ConfigError(f"{self.name}: expected one albedo, or one of each triangle")
+        if not 0.0 <= np.min(self.albedo) <= np.max(self.albedo) <= 1.0:
             raise ConfigError(f"{self.name}: expected an albedo in [0, 1], got {self.albedo}")
         check_transform(self.T_world_object, f"{self.name}: T_world_object")
 
@@ -79,7 +83,7 @@ def merge(objects: Sequence[SceneObject]) -> Geometry:
     keep = length > 1e-14
     if not keep.any():
         raise ConfigError("the scene has no triangle with an area", hint="is the mesh unit right?")
-    albedo = np.array([o.albedo for o in objects], dtype=np.float32)[owner]
+    albedo = np.concatenate([np.broadcast_to(np.float32(o.albedo), len(o.triangles)) for o in objects])
     target = np.array([o.target for o in objects])[owner]
     return Geometry(
         corners=corners[keep],

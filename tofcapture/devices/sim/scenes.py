@@ -7,6 +7,7 @@ directions within 65 deg of vertical at 0.8 m and half of them at 1.4 m, against
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -18,7 +19,19 @@ from tofcapture.devices.sim.scene import SceneObject
 from tofcapture.devices.sim.shapes import FAMILIES, ball, board
 from tofcapture.errors import ConfigError
 from tofcapture.frames import CALIBRATION
-from tofcapture.meshes import SUFFIXES, Mesh, cuboid, cylinder, extrude, move, read_mesh, settle
+from tofcapture.meshes import (
+    SUFFIXES,
+    Mesh,
+    circle,
+    cuboid,
+    cylinder,
+    extrude,
+    move,
+    read_mesh,
+    rectangle,
+    settle,
+)
+from tofcapture.pattern import pattern_from
 from tofcapture.poses import Float64, rotation_exp, transform
 
 TABLE_CENTRE: Float64 = np.array([0.70, 0.0, -0.50])  # m, base frame, on the table top
@@ -26,6 +39,8 @@ BOARD_CENTRE = np.array([0.70, 0.0, -0.22])
 BOARD_TILT = np.radians(-15.0)  # about base y: the board leans towards the arm
 _TABLE = (1.2, 1.6, 0.04)  # m
 _FLOOR = -1.2  # m, z in the base frame
+_SHEET = 0.0002  # m that a printed sheet stands out of its plate
+_INK = 0.06  # albedo of what is printed
 _REACH = 0.33  # m; targets stay within this disc about the table's centre
 
 
@@ -46,17 +61,21 @@ def mesh_files(folder: Path) -> list[Path]:
 
 
 def scene_objects(
-    name: str, seed: int, meshes: Mapping[str, Path] | None = None, mesh_unit: str = "m"
+    name: str,
+    seed: int,
+    meshes: Mapping[str, Path] | None = None,
+    mesh_unit: str = "m",
+    board: Path | None = None,
 ) -> list[SceneObject]:
     """Put everything into a scene, in the base frame.
 
     First come the objects (``target=True``), then table, pedestal, walls and clutter.
 
-    ``name`` is ``calibration`` for the board, that of one of ``meshes``, or a family of :data:`shapes.FAMILIES`, optionally
+    ``name`` is ``calibration`` for the board (the one of the TOML file ``board``, where that is given), that of one of ``meshes``, or a family of :data:`shapes.FAMILIES`, optionally
     with ``-<n>`` behind it (``mug``, ``mug-2``). Anything else is a seeded combination of one to four objects (``random-7``).
     """
     if name == CALIBRATION:
-        return [*_calibration(), *surroundings(name, seed, clutter=False)]
+        return [*_calibration(board), *surroundings(name, seed, clutter=False)]
     rng = generator(name, seed, "objects")
     if meshes and name in meshes:
         items = [(name, read_table_mesh(meshes[name], mesh_unit))]
@@ -125,19 +144,26 @@ def _free_place(
 
 
 def solid(
-    name: str, mesh: Mesh, albedo: float, at: ArrayLike, turn: ArrayLike = (0, 0, 0), *, target: bool = False
+    name: str,
+    mesh: Mesh,
+    albedo: float | Float64,
+    at: ArrayLike,
+    turn: ArrayLike = (0, 0, 0),
+    *,
+    target: bool = False,
 ) -> SceneObject:
     """Stand a mesh somewhere; ``turn`` is a rotation vector."""
     T = transform(rotation_exp(turn), np.asarray(at, dtype=np.float64))
-    return SceneObject(mesh[0], mesh[1], float(albedo), T, target=target, name=name)
+    return SceneObject(mesh[0], mesh[1], albedo, T, target=target, name=name)
 
 
-def _calibration() -> list[SceneObject]:
+def _calibration(board_file: Path | None = None) -> list[SceneObject]:
     """Stand the board with cut-outs up, and four solids whose slopes hold a registration in the board's plane.
 
     The board leans towards the arm, well above the table, so that cut-outs and outline stand before a clear background;
     nothing faces its front, so hardly any light reaches it by way of other surfaces.
     """
+    lean = (0, BOARD_TILT, 0)
     plate = move(board(), transform(np.eye(3), [0, 0, -0.005]))
     block = move(cuboid(0.16, 0.12, 0.10), transform(rotation_exp([0.6, 0.0, 0.0]), [0, 0, 0]))
     pyramid = cylinder(0.11, 0.16, segments=5)
@@ -145,7 +171,7 @@ def _calibration() -> list[SceneObject]:
     roof = extrude(np.array([[-0.1, 0], [0.1, 0], [0.0, 0.1]]), 0.18)
     ridge = move(roof, transform(rotation_exp([np.pi / 2, 0, 0]), [0, 0, 0]))
     return [
-        solid("board", plate, 0.7, BOARD_CENTRE, (0, BOARD_TILT, 0), target=True),
+        *(_plates(board_file) if board_file else [solid("board", plate, 0.7, BOARD_CENTRE, lean, target=True)]),
         *(_leg(x, y) for x, y in ((-0.06, 0.04), (0.12, 0.05), (-0.03, -0.16))),
         solid("ball", ball(0.085), 0.6, on_table(0.06, 0.36), target=True),
         solid("block", settle(block), 0.45, on_table(-0.13, 0.40), (0, 0, 0.5), target=True),
@@ -153,6 +179,35 @@ def _calibration() -> list[SceneObject]:
         solid("ridge", settle(ridge), 0.5, on_table(0.15, -0.38), (0, 0, 0.8), target=True),
         solid("peg", cylinder(0.05, 0.12, 48), 0.55, on_table(0.36, 0.02), target=True),
     ]  # fmt: skip
+
+
+def _plates(path: Path) -> list[SceneObject]:
+    """Make the board of a TOML file: a plate with its cut-outs, and what is printed on it, a sheet on its front."""
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        pattern = pattern_from(table["pattern"], str(path)) if "pattern" in table else None
+        size = np.zeros(2) if pattern is None else pattern.size + pattern.square
+        outline, thick = np.array(table.get("outline", rectangle(*size))), float(table["thickness"])
+        holes = [
+            np.array(h["corners"]) if "corners" in h else circle(h["radius"], tuple(h["centre"]), 64)
+            for h in table.get("hole", [])
+        ]
+    except (OSError, KeyError, ValueError, TypeError) as err:
+        raise ConfigError(f"{path}: expected a board, see docs/board.md: {err!r}") from err
+    at = BOARD_CENTRE - transform(rotation_exp((0, BOARD_TILT, 0)), np.zeros(3))[:3, 2] * thick / 2
+    sheet = 0.0 if pattern is None else _SHEET
+    out = [solid("board", extrude(outline, thick - sheet, holes), 0.7, at, (0, BOARD_TILT, 0), target=True)]
+    if pattern is not None:
+        x, y = pattern.cuts()
+        vertices = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), thick)], axis=-1).reshape(-1, 3)
+        corner = (np.arange(len(y) - 1)[:, None] * len(x) + np.arange(len(x) - 1)).reshape(-1)
+        cells = corner[:, None] + [0, 1, len(x) + 1, len(x)]
+        shade = np.where(pattern.dark(vertices[cells].mean(axis=1)[:, :2]), _INK, 0.7)
+        triangles = cells[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+        out.append(
+            solid("pattern", (vertices, triangles), np.repeat(shade, 2), at, (0, BOARD_TILT, 0), target=True)
+        )
+    return out
 
 
 def _leg(x: float, y: float) -> SceneObject:

@@ -263,18 +263,19 @@ class SimWorld:
 def shared_world(context: StationContext) -> SimWorld:
     """Return the world that all simulated drivers of one station share; made by the first that asks.
 
-    The station file's ``[sim]`` table holds ``seed``, optionally ``meshes`` (a folder) with ``mesh_unit``, ``faults`` on
-    demand, and overrides of constants.toml.
+    The station file's ``[sim]`` table holds ``seed``, optionally ``meshes`` (a folder) with ``mesh_unit``, ``board`` (a
+    board's TOML file that stands in for the packaged one), ``faults`` on demand, and overrides of constants.toml.
     """
     if "sim" not in context.shared:
         table = dict(context.config.get("sim", {}))
-        check_keys(table, {"seed", "meshes", "mesh_unit", "faults", *TABLES}, "[sim]")
+        check_keys(table, {"seed", "meshes", "mesh_unit", "board", "faults", *TABLES}, "[sim]")
         folder, unit = table.get("meshes"), str(table.get("mesh_unit", "m"))
+        board = context.folder / table["board"] if "board" in table else None
         paths = {} if folder is None else {p.stem: p for p in mesh_files(context.folder / folder)}
         world = SimWorld(
             read_constants(table, "station file"),
             int(table.get("seed", 0)),
-            lambda name, seed: scene_objects(name, seed, paths, unit),
+            lambda name, seed: scene_objects(name, seed, paths, unit, board),
             read_faults(table.get("faults", {})),
         )
         context.shared["sim"], context.shared["rig"] = world, world.nominal_rig()
