@@ -59,7 +59,7 @@ def test_small_images_give_corners_to_hundredths_of_a_pixel(name, roll):
     pixels, at = corners_in(image_of(board, SMALL, T, noise=1.0), board.pattern)
     true, _ = SMALL.project(np.column_stack([at, np.full(len(at), board.thickness)]) @ T[:3, :3].T + T[:3, 3])
     # A tag of an AprilGrid has two pixels a bit here, and not all are read.
-    assert len(at) > (0.3 if name == "aprilgrid" else 0.8) * len(board.pattern.corners)
+    assert len(at) > (0.2 if name == "aprilgrid" else 0.8) * len(board.pattern.corners)
     assert np.abs(pixels - true).max() < 0.1
     seen = seen_in_image(image_of(board, SMALL, T, noise=1.0), board, SMALL, NOTHING)
     assert rotation_angle(invert(T) @ seen.fit.T) < np.radians(0.3)
@@ -92,7 +92,7 @@ def test_lens_of_a_folder_of_images(tmp_path):
     true = dict(
         zip(
             ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-            (560, 564, 322, 250, -0.12, 0.05, 0.001, -0.0007),
+            (280, 282, 161, 125, -0.12, 0.05, 0.001, -0.0007),
             strict=True,
         )
     )

@@ -17,7 +17,7 @@ import numpy as np
 
 from tofcapture.errors import ConfigError
 from tofcapture.meshes import circle, inside, rectangle, signed_area
-from tofcapture.pattern import KINDS, Pattern, pattern_from
+from tofcapture.ops.pattern import KINDS, Pattern, pattern_from
 from tofcapture.poses import Float64
 
 BOARDS = Path(__file__).with_name("boards")

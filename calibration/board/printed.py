@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibration.board.geometry import Board
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, QualityError
-from tofcapture.pattern import Pattern, aruco_dictionary
+from tofcapture.ops.pattern import Pattern, aruco_dictionary
 from tofcapture.poses import Float64, transform
 
 WIDE = 960  # px; smaller images are enlarged before corners are looked for

@@ -31,7 +31,7 @@ from tofcapture.meshes import (
     rectangle,
     settle,
 )
-from tofcapture.pattern import pattern_from
+from tofcapture.ops.pattern import pattern_from
 from tofcapture.poses import Float64, rotation_exp, transform
 
 TABLE_CENTRE: Float64 = np.array([0.70, 0.0, -0.50])  # m, base frame, on the table top
