@@ -154,7 +154,7 @@ def _with_preset(defaults: dict[str, Any], overrides: Mapping[str, Any], where: 
             "cy": (height - 1) / 2,
         }
     if "mhz" in said:
-        each = list(zip(said["mhz"], said["phases"], strict=True))
+        each = list(zip(said["mhz"], said.get("phases", [[0, 90, 180, 270]] * len(said["mhz"])), strict=True))
         sensor["modulation_hz"] = [round(mhz * 1e6) for mhz, phases in each for _ in phases]
         sensor["phase_rad"] = [float(np.radians(p)) for _, phases in each for p in phases]
         sensor |= {"contrast": np.resize(sensor["contrast"], len(each)).tolist(), "range_error": []}
