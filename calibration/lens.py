@@ -162,7 +162,7 @@ def _camera(values: Float64, like: Camera) -> Camera:
 
 def _saturating(guess: _Guess) -> _Guess:
     """Start a rational lens near a polynomial barrel, as ``(1 + a r^2) / (1 + b r^2)``; with 9 a > b it folds nowhere."""
-    k1, k2, p1, p2, *_ = (*guess.camera.distortion, *(0.0,) * 5)
+    k1, k2, p1, p2 = lens_values(guess.camera)[4:8].tolist()
     if k1 >= 0:
         return guess
     b = max(-k2 / k1, 0.0)  # the Pade approximant

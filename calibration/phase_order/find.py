@@ -167,7 +167,6 @@ class _Blocks:
 
     def __init__(self, taps: Float64) -> None:
         self.taps = taps[:, :: max(1, taps.shape[1] // FEW)]
-        self._known: dict[Block, tuple[float, Block]] = {}
 
     @cached_property
     def size(self) -> float:
@@ -210,17 +209,18 @@ def _splits(channels: Block, counts: Sequence[int]) -> Iterator[tuple[Block, ...
 
 def _pairings(taps: Float64, counts: Sequence[int]) -> tuple[list[tuple[Block, ...]], float, float]:
     """Readings that leave as little beside offset and first harmonic as the best one's, its size, and the margin to the next."""
-    judge, known, readings = _Blocks(taps), {}, []
+    judge, known = _Blocks(taps), dict[Block, list[tuple[float, Block]]]()
+    readings: list[tuple[float, tuple[Block, ...]]] = []
     for split in _splits(tuple(range(len(taps))), counts):
         for own in split:
             known[own] = known.get(own) or judge.best(own)
         apart = judge.offsets(split) if min(counts) == 3 and len(counts) > 1 else 0.0
         readings += [
-            (np.sqrt(max(apart, *(left for left, _ in orders))), tuple(o for _, o in orders))
+            (float(np.sqrt(max(apart, *(left for left, _ in orders)))), tuple(o for _, o in orders))
             for orders in product(*(known[own][:3] for own in split))
         ]
     readings.sort()
-    best = float(readings[0][0])
+    best = readings[0][0]
     # Blocks of one exposure share B, so pairs may be exchanged between blocks: those ties are for later.
     floor = PAIRING_MARGIN * best + 1e-9
     ties = [r for s, r in readings if s <= floor]
@@ -235,7 +235,7 @@ def _pairings(taps: Float64, counts: Sequence[int]) -> tuple[list[tuple[Block, .
             f"phase order refused, ambiguous: {len(ties)} ways to pair the channels fit alike",
             hint="record a scene with more than one distance, brighter, and more frames",
         )
-    following = float(readings[len(ties)][0]) if len(ties) < len(readings) else 1.0
+    following = readings[len(ties)][0] if len(ties) < len(readings) else 1.0
     return ties, best, 1 - best / max(following, 1e-9)
 
 
@@ -322,7 +322,7 @@ def _sign_from_depth(
         raise DataError(f"reference depth: expected at least 100 known pixels, got {int(known.sum())}")
     back = [np.exp(-4j * np.pi * f * radial[known] / SPEED_OF_LIGHT) for f in hz]
     fit = [
-        np.mean([abs(_mean_unit(conj(p[known]) * b)) for p, b in zip(z, back, strict=True)])
+        float(np.mean([abs(_mean_unit(conj(p[known]) * b)) for p, b in zip(z, back, strict=True)]))
         for conj in (np.asarray, np.conj)
     ]
     near, far = sorted(map(_spread, fit))

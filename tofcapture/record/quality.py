@@ -170,14 +170,20 @@ def _drops(times: NDArray[np.int64]) -> int:
     return int(np.maximum(np.round(gaps / usual) - 1, 0).sum()) if usual > 0 else 0
 
 
-def _overlap(stereo: StereoFrame, rig: Rig) -> float:
-    """Share of the ToF image's cells into which a stereo point falls."""
-    camera = rig.tof
+def _in_tof_image(stereo: StereoFrame, rig: Rig) -> tuple[Float64, Float64]:
+    """Return stereo points (N, 3), ToF frame, that lie in the ToF image, and their pixels (N, 2)."""
     step = max(1, stereo.points.shape[1] // _COLUMNS)
     points = stereo.points[::step, ::step].reshape(-1, 3).astype(np.float64)
     points = transform_points(rig.T_tof_stereo, points[np.isfinite(points).all(axis=1)])
-    pixels = camera.project(points)[0]
-    u, v = pixels[np.isfinite(pixels).all(axis=1)].T
+    pixels = rig.tof.project(points)[0]
+    within = ((pixels > -0.5) & (pixels < [rig.tof.width - 0.5, rig.tof.height - 0.5])).all(axis=1)
+    return points[within], pixels[within]
+
+
+def _overlap(stereo: StereoFrame, rig: Rig) -> float:
+    """Share of the ToF image's cells into which a stereo point falls."""
+    camera = rig.tof
+    u, v = _in_tof_image(stereo, rig)[1].T
     cells = (min(_CELLS[0], camera.height), min(_CELLS[1], camera.width))
     edges = ((-0.5, camera.height - 0.5), (-0.5, camera.width - 0.5))
     hit = np.histogram2d(v, u, bins=cells, range=edges)[0]
@@ -203,24 +209,18 @@ def _against_stereo(phasor: Complex128, info: TofInfo, stereo: StereoFrame, rig:
 
     ``misread`` is by how much another frequency of the camera, or the other sign, makes the phases agree better; 0 where they agree.
     """
-    points = stereo.points[
-        :: max(1, stereo.points.shape[0] // _COLUMNS), :: max(1, stereo.points.shape[1] // _COLUMNS)
-    ]
-    points = points.reshape(-1, 3).astype(np.float64)
-    points = transform_points(rig.T_tof_stereo, points[np.isfinite(points).all(axis=1)])
-    pixels = rig.tof.project(points)[0]
-    inside_image = (pixels > -0.5).all(axis=1) & (pixels < [rig.tof.width - 0.5, rig.tof.height - 0.5]).all(
-        axis=1
-    )
-    u, v = np.rint(pixels[inside_image]).astype(np.intp).T
-    points = points[inside_image]
+    points, pixels = _in_tof_image(stereo, rig)
+    if len(points) < _FEW or phasor.shape[1:] != rig.tof.shape:
+        return {"misread": 0.0, "out_of_reach": 0.0}
+    u, v = np.rint(pixels).astype(np.intp).T
     range_ = (np.linalg.norm(points, axis=1) + np.linalg.norm(points - info.illuminator, axis=1)) / 2
     z = phasor[:, v, u]
     lit = np.abs(z).min(axis=0) > _BRIGHT
-    if lit.sum() < _FEW or phasor.shape[1:] != rig.tof.shape:
-        return {"misread": 0.0, "out_of_reach": 0.0}
     hz = frequencies(info.modulation_hz)
     low, high = info.reach or (0.0, unambiguous(hz))
+    beyond = float(((range_ < low) | (range_ > high)).mean())
+    if lit.sum() < _FEW:
+        return {"misread": 0.0, "out_of_reach": beyond}
     unit = z[:, lit] / np.abs(z[:, lit])
     back = [np.exp(-4j * np.pi / SPEED_OF_LIGHT * f * range_[lit]) for f in hz]
     worse = [0.0]
@@ -228,7 +228,7 @@ def _against_stereo(phasor: Complex128, info: TofInfo, stereo: StereoFrame, rig:
         spread = [[_spread(each * b) for b in back] for each in (own, own.conj())]
         stated, best = spread[0][i], min(map(min, spread))
         worse.append(stated / max(best, _SPREAD) if stated > 4 * _SPREAD else 0.0)
-    return {"misread": max(worse), "out_of_reach": float(((range_ < low) | (range_ > high)).mean())}
+    return {"misread": max(worse), "out_of_reach": beyond}
 
 
 def _spread(unit: Complex128) -> float:
