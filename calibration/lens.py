@@ -262,7 +262,8 @@ def _corner_equations(at: Float64, view: BoardSeen, T: Float64, guess: _Guess) -
     camera, values = guess.camera, lens_values(guess.camera)
 
     def off(camera: Camera, T: Float64) -> Float64:
-        return (camera.project(transform_points(T, at))[0] - view.pixels).reshape(-1)
+        out: Float64 = (camera.project(transform_points(T, at))[0] - view.pixels).reshape(-1)
+        return out
 
     residual, turns = off(camera, T), TINY * np.eye(6)
     own = np.stack([(off(camera, exp(turn) @ T) - residual) / TINY for turn in turns], axis=1)
@@ -270,8 +271,8 @@ def _corner_equations(at: Float64, view: BoardSeen, T: Float64, guess: _Guess) -
     by_lens = [(off(c, T) - residual) / TINY for c in changed]
     shared = np.column_stack([*by_lens, np.zeros(len(residual))])
     good = np.isfinite(np.column_stack([residual, own, shared])).all(axis=1)
-    known = (np.where(np.isfinite(x), x, 0.0) for x in (shared, own, residual))
-    return _Equations(*known, good.astype(np.float64), good)
+    shared, own, residual = (np.where(np.isfinite(x), x, 0.0) for x in (shared, own, residual))
+    return _Equations(shared, own, residual, good.astype(np.float64), np.asarray(good))
 
 
 def _solve(equations: Sequence[_Equations], away: Float64, free: int) -> Float64:

@@ -75,13 +75,11 @@ def find_start(pairs: Sequence[Pair], pool: Pool) -> Float64:
     """
     found: list[Float64] = []
     for pair in pairs:
-        if (
-            check_clouds(pair.source, pair.target) is None
-            and (T := pool.call(clear_answer, pair.source, pair.target)) is not None
-        ):
-            if any(same_answer(T, other) for other in found):
-                return T
-            found.append(T)
+        empty = check_clouds(pair.source, pair.target) is not None
+        T: Float64 | None = None if empty else pool.call(clear_answer, pair.source, pair.target)
+        if T is not None and any(same_answer(T, other) for other in found):
+            return T
+        found += [] if T is None else [T]
     raise QualityError(
         f"no start without a guess: of {len(pairs)} views {len(found)} tell one answer by themselves, and no two the same",
         hint="pass --initial rig.toml with the bracket's drawing, good to 5 degrees and 5 cm",

@@ -82,7 +82,8 @@ def _about(sight: Sight, board: Board, T: Float64, near: float) -> Sight:
     def kept(points: Float64) -> Float64:
         xyz = (points - T[:3, 3]) @ T[:3, :3]
         beside = ((xyz[:, :2] > low) & (xyz[:, :2] < high)).all(axis=1)
-        return points[beside & (np.abs(xyz[:, 2] - board.thickness) < near)]
+        out: Float64 = points[beside & (np.abs(xyz[:, 2] - board.thickness) < near)]
+        return out
 
     return replace(sight, rims=kept(sight.rims), surface=kept(sight.surface))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from tofcapture.cli import kit
 from tofcapture.cli.kit import Command, Outcome
@@ -13,6 +13,7 @@ from tofcapture.errors import ConfigError
 
 if TYPE_CHECKING:
     from calibration.evidence import OldRig
+    from tofcapture.rig import Rig
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -56,8 +57,9 @@ def _run(args: argparse.Namespace) -> Outcome:
     from calibration.evidence import drift, drift_table, drift_text, load_old
     from tofcapture.rig import load_rig, rig_to_dict
 
-    free = str(args.initial) == "none"
-    initial = "none" if free else None if args.initial is None else load_rig(args.initial)
+    initial: Rig | Literal["none"] | None = None
+    if args.initial is not None:
+        initial = "none" if str(args.initial) == "none" else load_rig(args.initial)
     old = None if args.compare is None else load_old(args.compare)  # before align replaces rig.toml
     with kit.progress() as progress:
         out = args.out or args.recording

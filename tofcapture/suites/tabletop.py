@@ -92,7 +92,11 @@ def _scene(
         identities=tuple(i for i in identities if any(i.endswith(u) for u in used)),
         poses=None,
         plan_name=name,
-        facts={"kind": kind, "materials": chosen, "albedo": [round(o.albedo, 4) for o in targets]},
+        facts={
+            "kind": kind,
+            "materials": chosen,
+            "albedo": [round(float(np.mean(o.albedo)), 4) for o in targets],
+        },
     )
 
 

@@ -203,7 +203,7 @@ def _plates(path: Path) -> list[SceneObject]:
         corner = (np.arange(len(y) - 1)[:, None] * len(x) + np.arange(len(x) - 1)).reshape(-1)
         cells = corner[:, None] + [0, 1, len(x) + 1, len(x)]
         shade = np.where(pattern.dark(vertices[cells].mean(axis=1)[:, :2]), _INK, 0.7)
-        triangles = cells[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+        triangles = cells[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3).astype(np.int64)
         out.append(
             solid("pattern", (vertices, triangles), np.repeat(shade, 2), at, (0, BOARD_TILT, 0), target=True)
         )
