@@ -15,7 +15,6 @@ from calibration.registration.pairs import Pair, calibration_views, load_pair
 from tofcapture.errors import DataError
 from tofcapture.files.disk import check_writable
 from tofcapture.files.seal import write_text
-from tofcapture.frames import CALIBRATION
 from tofcapture.pool import Pool
 from tofcapture.poses import invert
 from tofcapture.rig import Rig, dumps_rig
@@ -28,7 +27,6 @@ def align(
     progress: Progress = lambda _stage, _done, _total: None,
     method: str = "averaged",
     out: str | Path | None = None,
-    scene: str = CALIBRATION,
 ) -> tuple[Rig, dict[str, Any]]:
     """Align the cameras of a recording by averaged ICP; write ``evidence.json``, then ``rig.toml``.
 
@@ -50,8 +48,6 @@ def align(
         accepted views that starts at the average and finds the range errors too.
     out
         Folder of ``rig.toml`` and ``evidence.json``; by default the recording.
-    scene
-        Whose views: the board's, or those of any scene of enough relief.
 
     Returns
     -------
@@ -74,7 +70,7 @@ def align(
     recording = Path(recording)
     out = recording if out is None else Path(out)
     check_writable(out, "name a folder that can be written: --out")
-    pairs = _load(recording, scene, progress)
+    pairs = _load(recording, progress)
     start = initial if isinstance(initial, Rig) else pairs[0].rig
     if initial == "none":
         with Pool(1, pinned=True) as pool:
@@ -91,8 +87,8 @@ def align(
     return rig, evidence
 
 
-def _load(recording: Path, scene: str, progress: Progress) -> list[Pair]:
-    paths = calibration_views(recording, scene)
+def _load(recording: Path, progress: Progress) -> list[Pair]:
+    paths = calibration_views(recording)
     demand_pairs(len(paths), [None] * len(paths))
     pairs = []
     for i, path in enumerate(paths):

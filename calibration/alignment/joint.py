@@ -227,7 +227,7 @@ def _step(equations: Sequence[_Equations], now: _Estimate, free: slice, *, fine:
     if fine:
         variances = _spread(equations, reduced, x, _inverse(H))
         r = np.concatenate([e.rim_residuals for e in equations])
-        rim_sigma = float(1.4826 * np.median(np.abs(r))) if len(r) else RIM_SIGMA
+        rim_sigma = float(1.4826 * np.median(np.abs(r)))
     W = transform(np.eye(3), now.centre)
     T = now.T @ W @ exp(-x[:6]) @ invert(W)
     U, _, Vt = np.linalg.svd(T[:3, :3])  # rounding must not add up

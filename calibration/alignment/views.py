@@ -16,17 +16,15 @@ from calibration.registration.clouds import (
     stereo_cloud,
     surface_points,
     tof_depth,
-    trusted_points,
 )
 from calibration.registration.rims import ACROSS, Rims, lit_rims, square_rims, unveiled_rims
 from tofcapture.camera import Camera
 from tofcapture.channels import SPEED_OF_LIGHT
-from tofcapture.frames import CALIBRATION, View
+from tofcapture.frames import View
 from tofcapture.ops import phase
 from tofcapture.poses import Float64
 from tofcapture.rig import RangeError
 
-NO_CLOUD = Cloud(np.zeros((0, 3)), np.zeros((0, 3)))
 STRIDE = 5  # surface pixels skipped; thousands a view remain, and their common bias is not lowered by more
 RIM_BESIDE = TOF_MARGIN + ACROSS + 1  # px that a rim may lie off its board's trusted pixels
 HALO_RADII = (0.05, 0.15, 0.45)  # of the image width: narrow, middle and wide lens scattering
@@ -82,9 +80,7 @@ def joint_view_of(view: View) -> JointView:
     phasor, depth = tof_depth(view.tof)
     celsius = float(np.mean(view.tof.celsius))
     _, signals = phase.Decoder(info).signals(view.tof.raw.mean(axis=0, dtype=np.float64), celsius)
-    on_board = view.scene == CALIBRATION
-    chosen = surface_points if on_board else trusted_points
-    board = _pixels_of(chosen(view.tof, depth), info.camera)
+    board = _pixels_of(surface_points(view.tof, depth), info.camera)
     pixels = board[::STRIDE]
     hz = phase.frequencies(info.modulation_hz)
     rays = (info.camera.rays / info.camera.ray_lengths[..., None]).reshape(-1, 3)
@@ -93,9 +89,7 @@ def joint_view_of(view: View) -> JointView:
     lit = np.abs(phasor).reshape(len(hz), -1)[:, pixels]
     sigma = [high_sigma * hz[-1] / f * lit[-1] / a for f, a in zip(hz, lit, strict=True)]
     surface = stereo_cloud(view.stereo)
-    nothing = Rims(np.zeros((0, 3)), np.zeros((0, 3)))  # what any scene's rims are to two cameras
-    stereo = unveiled_rims(view.stereo.points, view.stereo.info.camera) if on_board else nothing
-    rims = lit_rims(phasor, depth, info.camera, info.illuminator) if on_board else nothing
+    stereo = unveiled_rims(view.stereo.points, view.stereo.info.camera)
     return JointView(
         illuminator=info.illuminator,
         modulation_hz=hz,
@@ -104,10 +98,10 @@ def joint_view_of(view: View) -> JointView:
         ranges=signals.ranges.reshape(len(hz), -1)[:, pixels].astype(np.float64),
         sigma=np.stack(sigma),
         halos=halo_errors(phasor, hz).reshape(len(hz), -1, len(HALO_RADII))[:, pixels],
-        rims=_beside(rims, board, info.camera) if on_board else rims,
+        rims=_beside(lit_rims(phasor, depth, info.camera, info.illuminator), board, info.camera),
         factory=info.range_errors,
         surface=surface,
-        held=square_rims(stereo, surface, view.rig.T_stereo_tof[:3, 3]) if on_board else NO_CLOUD,
+        held=square_rims(stereo, surface, view.rig.T_stereo_tof[:3, 3]),
     )
 
 

@@ -36,12 +36,6 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         help="averaged as in the paper, weighted by information, or joint with range errors (default: averaged)",
     )
     parser.add_argument(
-        "--scene",
-        default="calibration",
-        metavar="NAME",
-        help="views of this scene instead of the board's: objects of enough relief, best with --method joint",
-    )
-    parser.add_argument(
         "--initial",
         type=Path,
         metavar="RIG.toml|none",
@@ -63,7 +57,7 @@ def _run(args: argparse.Namespace) -> Outcome:
     old = None if args.compare is None else load_old(args.compare)  # before align replaces rig.toml
     with kit.progress() as progress:
         out = args.out or args.recording
-        rig, evidence = align(args.recording, args.backend, initial, progress, args.method, out, args.scene)
+        rig, evidence = align(args.recording, args.backend, initial, progress, args.method, out)
         page, absent = _page(args.recording, out, old, evidence, progress)
     paths = {"rig": str(out / "rig.toml"), "evidence": str(out / "evidence.json")}
     moved = None if old is None else drift(evidence, old)

@@ -112,12 +112,14 @@ def tof_depth(burst: TofBurst) -> tuple[NDArray[np.complex128], Float64]:
 def surface_points(burst: TofBurst, depth: Float64) -> Float64:
     """Choose trustworthy points (N, 3), ToF frame, metres, on the surface that the rig looks at.
 
-    Of what :func:`trusted_points` are, that is the piece which fills most of the image's centre: the board. Other surfaces see the
-    board's light, which lengthens their ranges by up to a centimetre. ``depth`` is that of :func:`tof_depth`.
+    Dark pixels, pixels within two of a depth edge and everything outside the working depth are dropped. What is left falls
+    into pieces, and the one that fills most of the image's centre is the board. Other surfaces see the board's light, which
+    lengthens their ranges by up to a centimetre. ``depth`` is that of :func:`tof_depth`.
     """
     from scipy.ndimage import label
 
-    good = _trusted(burst, depth)
+    edge = dilate(plane_departure(depth) > TOF_JUMP, TOF_MARGIN)
+    good = ~edge & (range_sigma(burst) < MAX_SIGMA) & _within(depth)
     pieces, count = label(good)
     height, width = depth.shape
     centre = pieces[height // 4 : height - height // 4, width // 4 : width - width // 4]
@@ -125,17 +127,6 @@ def surface_points(burst: TofBurst, depth: Float64) -> Float64:
     sizes[0] = 0
     points: Float64 = burst.info.camera.unproject(depth)[good & (pieces == sizes.argmax())]
     return points
-
-
-def trusted_points(burst: TofBurst, depth: Float64) -> Float64:
-    """Choose trustworthy points (N, 3), ToF frame, metres, on all surfaces: neither dark, nor within two pixels of an edge, nor far."""
-    points: Float64 = burst.info.camera.unproject(depth)[_trusted(burst, depth)]
-    return points
-
-
-def _trusted(burst: TofBurst, depth: Float64) -> Mask:
-    edge = dilate(plane_departure(depth) > TOF_JUMP, TOF_MARGIN)
-    return np.asarray(~edge & (range_sigma(burst) < MAX_SIGMA) & _within(depth))
 
 
 def stereo_cloud(frame: StereoFrame) -> Cloud:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.registration.clouds import Cloud, stereo_cloud, surface_points, tof_depth, trusted_points
+from calibration.registration.clouds import Cloud, stereo_cloud, surface_points, tof_depth
 from calibration.registration.rims import REPEAT, rim_cloud, stereo_rims, tof_rims
 from tofcapture.errors import DataError
 from tofcapture.files.view import find_views, read_view
-from tofcapture.frames import CALIBRATION, View
+from tofcapture.frames import View
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig
 
@@ -33,34 +33,34 @@ class Pair:
     truth: Float64 | None  #: (4, 4) ``T_tof_stereo`` of a simulated view, else None
 
 
-def calibration_views(recording: Path, scene: str = CALIBRATION) -> list[Path]:
-    """Find the sealed views of the board, or of another scene, of a recording, in order; :class:`DataError` when there are none."""
+def calibration_views(recording: Path) -> list[Path]:
+    """Find the sealed board views of a recording, in order; :class:`DataError` when there are none."""
     recording = Path(recording)
-    folder = recording / "views" / scene
+    folder = recording / "views" / "calibration"
     found = list(find_views(recording).get(folder.name, ()))
     if not found:
-        how = "--calibration" if scene == CALIBRATION else f"--scene {scene}"
         raise DataError(
-            f"{recording}: expected {scene} views in {folder}, found none",
-            hint=f"tofcapture record {how} --out {recording}",
+            f"{recording}: expected calibration views in {folder}, found none",
+            hint=f"tofcapture record --calibration --out {recording}",
         )
     return found
 
 
 def pair_of(view: View, name: str, sha256: str) -> Pair:
-    """Reduce a view to its pair of clouds: of the board alone, or of any other scene all surfaces.
-
-    Round things end elsewhere for each camera, so that rims of a scene are of no use.
-    """
+    """Reduce a view to its pair of clouds."""
     info = view.tof.info
     phasor, depth = tof_depth(view.tof)
-    common = (view.rig, max(info.modulation_hz), None if view.truth is None else view.truth.T_tof_stereo)
-    if view.scene != CALIBRATION:
-        return Pair(name, sha256, trusted_points(view.tof, depth), stereo_cloud(view.stereo), *common)
     rims = np.repeat(tof_rims(phasor, depth, info.camera).points, REPEAT, axis=0)
     held = rim_cloud(stereo_rims(view.stereo.points), view.rig.T_stereo_tof[:3, 3])
-    source = np.concatenate([rims, surface_points(view.tof, depth)])
-    return Pair(name, sha256, source, held + stereo_cloud(view.stereo), *common)
+    return Pair(
+        name=name,
+        sha256=sha256,
+        source=np.concatenate([rims, surface_points(view.tof, depth)]),
+        target=held + stereo_cloud(view.stereo),
+        rig=view.rig,
+        modulation_hz=max(info.modulation_hz),
+        truth=None if view.truth is None else view.truth.T_tof_stereo,
+    )
 
 
 def load_pair(recording: Path, path: Path) -> Pair:
