@@ -269,7 +269,7 @@ def test_the_report_s_numbers_are_those_of_the_sensor(recording):
             turned = 4 * np.pi * error.modulation_hz / SPEED_OF_LIGHT * r
             put_in = error.at(turned, phase.radius_px(CAMERA), 45.0, image_places(CAMERA))
             assert 1e3 * put_in.min() - 2 < line["before_mm"] < 1e3 * put_in.max() + 2
-            assert abs(line["left_out_mm"]) < 4
+            assert abs(line["left_out_mm"]) < 5
             assert line["pixels"] > 100
         assert {round(10 * line["from_m"]) for line in row["by_range"]} >= {3, 7, 9, 11, 13}
         assert 10 < row["before_mm"] < 30
