@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tofcapture.camera import Camera
-from tofcapture.files.view import read_view
+from tofcapture.files.view import open_view
 from tofcapture.frames import View
 from tofcapture.libraries import load_open3d
 from tofcapture.ops.phase import Decoder
@@ -61,7 +61,7 @@ def process(view: View, rig: Rig) -> tuple[dict[str, np.ndarray], np.ndarray]:
 
 def build(path: Path, rig: Rig, out: Path) -> tuple[dict[str, np.ndarray], View]:
     """Read, process, write without compression and without fsync."""
-    view = read_view(path)
+    view = open_view(path)
     arrays, _ = process(view, rig)
     np.savez(out, **arrays)
     return arrays, view

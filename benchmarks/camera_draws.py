@@ -22,7 +22,7 @@ from tofcapture.devices.sim.world import factory_calibration
 from tofcapture.rig import RangeError
 from tofcapture_model.data import FrameDataset, batched, frame_decoder, make_frame
 from tofcapture_model.networks.baselines import sensor_estimate
-from tofcapture_model.networks.checkpoint import load_model
+from tofcapture_model.networks.checkpoint import load_checkpoint
 from tofcapture_model.networks.joint import JointModel
 
 SEED = 900_000  # far from those of any data
@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1)
     args = parser.parse_args()
     data = FrameDataset(args.dataset, args.split, frames=1, cache_bytes=2e9)
-    model, _, _ = load_model(args.weights)
+    model, _, _ = load_checkpoint(args.weights)
     constants = read_constants({}, "the simulator's constants")
 
     def line(what: str, row: np.ndarray) -> None:

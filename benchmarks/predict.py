@@ -26,7 +26,7 @@ from tofcapture_model.frame import Frame, frame_to
 from tofcapture_model.inference.export import ask_onnx, export, open_onnx
 from tofcapture_model.inference.predict import Ask, has_bfloat16, predict_raw, recorded, torch_model
 from tofcapture_model.networks import build_model
-from tofcapture_model.networks.checkpoint import find_model, load_model, save_model
+from tofcapture_model.networks.checkpoint import find_model, load_checkpoint, save_model
 
 
 def raw_frame() -> np.ndarray:
@@ -90,7 +90,7 @@ def main() -> None:
         if args.preset:
             config = preset(args.preset)
             weights = save_model(Path(folder) / "model.safetensors", build_model(config), config, {})
-        model, _, _ = load_model(weights)
+        model, _, _ = load_checkpoint(weights)
         ask, _ = torch_model(weights, args.device)
         decoder = frame_decoder(info, NOMINAL_CAMERA)
         frame = batched(make_frame(raw, info, NOMINAL_CAMERA, decoder=decoder))

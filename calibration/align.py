@@ -15,6 +15,7 @@ from calibration.registration.pairs import Pair, calibration_views, load_pair
 from tofcapture.errors import DataError
 from tofcapture.files.disk import check_writable
 from tofcapture.files.seal import write_text
+from tofcapture.libraries import called
 from tofcapture.pool import Pool
 from tofcapture.poses import invert
 from tofcapture.rig import Rig, dumps_rig
@@ -100,3 +101,6 @@ def _load(recording: Path, progress: Progress) -> list[Pair]:
                 hint="use one recording per rig",
             )
     return pairs
+
+
+called(__name__, "calibration.align:align")

@@ -7,13 +7,13 @@ import numpy as np
 
 from calibration.registration.clouds import stereo_cloud, surface_points, tof_depth
 from calibration.registration.gate import register
-from tofcapture.files.view import read_view
+from tofcapture.files.view import open_view
 from tofcapture.poses import invert, rotation_angle
 
 
 def main(path: str) -> None:
     """Start from the rig that the view was taken with, and say how far registration moves it."""
-    view = read_view(Path(path))
+    view = open_view(Path(path))
     _, depth = tof_depth(view.tof)
     source = surface_points(view.tof, depth)  # (N, 3), ToF frame
     target = stereo_cloud(view.stereo)  # points and normals, stereo frame

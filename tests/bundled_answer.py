@@ -14,7 +14,7 @@ from tests.test_model_predict import table_top
 from tofcapture.frames import TofInfo
 from tofcapture_model.data import batched, make_frame
 from tofcapture_model.data.raw_input import NOMINAL_CAMERA
-from tofcapture_model.networks.checkpoint import load_model
+from tofcapture_model.networks.checkpoint import load_checkpoint
 
 KEPT = Path(__file__).with_suffix(".npz")
 EVERY = 20  # pixels
@@ -25,7 +25,7 @@ def answer():
     raw = table_top(NOMINAL_CAMERA)[0]
     frame = batched(make_frame(raw, TofInfo("", "", NOMINAL_CAMERA, np.zeros(3)), NOMINAL_CAMERA))
     with torch.no_grad():
-        found = load_model(None)[0](frame)
+        found = load_checkpoint(None)[0](frame)
     names = ("depth", "normals", "error")
     return {name: getattr(found, name)[0, ..., ::EVERY, ::EVERY].numpy() for name in names}
 

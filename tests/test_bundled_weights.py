@@ -17,7 +17,7 @@ from tofcapture.files.manifest import load_manifest
 from tofcapture_model.config import loads_config, preset
 from tofcapture_model.evaluation.suite import run_suite
 from tofcapture_model.inference.export import example
-from tofcapture_model.networks.checkpoint import find_model, load_model
+from tofcapture_model.networks.checkpoint import find_model, load_checkpoint
 
 CARD = files("tofcapture_model") / "weights" / "MODEL_CARD.md"
 LARGEST = 16 * 2**20  # bytes
@@ -25,7 +25,7 @@ LARGEST = 16 * 2**20  # bytes
 
 def test_the_bundled_network_is_the_preset_compact_and_finite():
     """Loaded without a path: the network of `compact`, half-precision file, float32 model, a finite answer at twice the size."""
-    model, config, provenance = load_model(None)
+    model, config, provenance = load_checkpoint(None)
     assert config.network == preset("compact").network
     assert find_model(None).stat().st_size < LARGEST
     assert loads_config(find_model(None).with_suffix(".toml").read_text(encoding="utf-8")) == config
@@ -39,7 +39,7 @@ def test_the_bundled_network_is_the_preset_compact_and_finite():
 
 def test_the_card_names_the_data_that_the_weights_remember():
     """Digest of the manifest, steps and the factor of the uncertainty stand in the card as in the file."""
-    provenance = load_model(None)[2]
+    provenance = load_checkpoint(None)[2]
     text = CARD.read_text(encoding="utf-8")
     assert provenance["manifest_sha256"][:16] in text
     assert all(digest[:16] in text for digest in provenance["also"].values())

@@ -14,7 +14,7 @@ from calibration.alignment.diagnosis import check_start, unusable
 from tests.stations import HALF_SIZE_CAMERAS
 from tofcapture.cli import main
 from tofcapture.errors import ConfigError, DataError, QualityError
-from tofcapture.files.view import read_view, view_path, write_view
+from tofcapture.files.view import open_view, view_path, write_view
 from tofcapture.poses import invert, transform
 
 VIEWS = 4
@@ -41,7 +41,7 @@ def recording(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def views(recording):
-    return [read_view(view_path(recording, "calibration", i)) for i in range(VIEWS)]
+    return [open_view(view_path(recording, "calibration", i)) for i in range(VIEWS)]
 
 
 def of_stereo(view, change):

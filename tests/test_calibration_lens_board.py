@@ -18,7 +18,7 @@ from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.devices.station import DEFAULT
 from tofcapture.errors import DataError
-from tofcapture.files.view import read_view
+from tofcapture.files.view import open_view
 from tofcapture.poses import invert, look_at
 from tofcapture.rig import dumps_rig, load_rig
 
@@ -145,7 +145,7 @@ def test_a_recording_through_an_unknown_lens_gives_the_lens(tmp_path, capsys):
     station.write_text(f"{DEFAULT.read_text()}\n[sim.tof]\ndistortion = {list(lens)}\n")
     recording = tmp_path / "board"
     assert main(["record", "--calibration", "--station", str(station), "--out", str(recording)]) == 0
-    rig = read_view(min((recording / "views/calibration").glob("*.h5"))).rig
+    rig = open_view(min((recording / "views/calibration").glob("*.h5"))).rig
     true = rig.tof
     assert true.distortion == lens
     wrong = replace(true, fx=true.fx * 1.01, fy=true.fy * 0.99, cx=true.cx + 2, cy=true.cy - 2, distortion=())

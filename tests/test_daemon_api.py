@@ -19,7 +19,7 @@ import pytest
 
 from tests import PATIENCE, until
 from tofcapture.errors import BusyError, DataError, DeviceError, UsageError
-from tofcapture.files.view import read_view
+from tofcapture.files.view import open_view
 from tofcapture.record.daemon import client
 from tofcapture.record.daemon.client import ask, hand_over
 
@@ -134,7 +134,7 @@ def test_records_a_scene_with_pause_and_previews(tmp_path):
         assert {b"tofcapture_views_sealed_total 6", b"tofcapture_paused 0"} <= metrics
     for view in views:
         assert (
-            read_view(tmp_path / "root" / "r" / "views" / "mug" / f"view-{view['index']:03d}.h5").scene
+            open_view(tmp_path / "root" / "r" / "views" / "mug" / f"view-{view['index']:03d}.h5").scene
             == "mug"
         )
 
@@ -316,7 +316,7 @@ def test_one_view_is_taken_again(tmp_path):
         after = {path.name: path.read_bytes() for path in folder.glob("view-*.h5*")}
         assert after.pop("view-001.h5.retaken") == before["view-001.h5"]
         assert {name for name in before if after[name] != before[name]} == {"view-001.h5"}
-        assert read_view(folder / "view-001.h5").index == 1
+        assert open_view(folder / "view-001.h5").index == 1
         daemon.record(3, retake=7)
         daemon.wait(lambda s: s["queue"].get("failed"))
         assert "retake" in daemon.ask("GET", "/v1/jobs")["jobs"][0]["reason"]

@@ -30,7 +30,7 @@ from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.seal import sha256_of
 from tofcapture.files.shard import ShardReader
-from tofcapture.files.view import read_view, view_path, write_view
+from tofcapture.files.view import open_view, view_path, write_view
 from tofcapture.frames import ArmState, View
 from tofcapture.ops.crop import Crop
 from tofcapture.ops.project import Projection
@@ -96,7 +96,7 @@ def recording(tmp_path_factory):
     for scene, indices in (("box", (0, 2)), ("mug", (0,)), ("gear", (1,)), ("calibration", (0,))):
         for i in indices:
             write_view(view_path(root, scene, i), simulate(scene, i))
-    (root / "rig.toml").write_text(dumps_rig(true_rig(read_view(view_path(root, "box", 0)))))
+    (root / "rig.toml").write_text(dumps_rig(true_rig(open_view(view_path(root, "box", 0)))))
     return root
 
 
@@ -359,7 +359,7 @@ def test_a_view_without_stereo_costs_no_scene(recording, tmp_path, capsys):
     copy = shutil.copytree(recording, tmp_path / "recording")
     for scene, index in (("box", 2), ("gear", 1)):
         path = view_path(copy, scene, index)
-        seen = read_view(path)
+        seen = open_view(path)
         path.unlink()
         write_view(path, blind(seen))
     out = tmp_path / "out"
@@ -376,7 +376,7 @@ def test_a_view_without_stereo_costs_no_scene(recording, tmp_path, capsys):
 
 def test_a_rig_that_looks_elsewhere_fails_all(recording, tmp_path):
     """With the stereo camera turned about, no scene has ground truth."""
-    rig = true_rig(read_view(view_path(recording, "box", 0)))
+    rig = true_rig(open_view(view_path(recording, "box", 0)))
     path = tmp_path / "rig.toml"
     path.write_text(dumps_rig(replace(rig, T_tof_stereo=np.diag([-1.0, 1.0, -1.0, 1.0]))))
     result = build_dataset([recording], tmp_path / "out", path, jobs=1)

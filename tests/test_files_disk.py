@@ -31,7 +31,7 @@ from tofcapture.files import disk
 from tofcapture.files.check import check
 from tofcapture.files.disk import DiskFull, NoLocksError, check_writable, full_disk_named, hold_file
 from tofcapture.files.seal import digest_path, sealed_digest
-from tofcapture.files.view import find_views, read_view, view_path
+from tofcapture.files.view import find_views, open_view, view_path
 from tofcapture.record import journal as journals
 from tofcapture.record.daemon.store import Store
 from tofcapture.record.journal import Journal, journal_path
@@ -46,7 +46,7 @@ def test_sealed_files_are_read_without_locks(tmp_path):
     path = view_path(tmp_path, "mug", 0)
     with path.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        code = f"from pathlib import Path; from tofcapture.files.view import read_view; read_view(Path({str(path)!r}))"
+        code = f"from pathlib import Path; from tofcapture.files.view import open_view; open_view(Path({str(path)!r}))"
         subprocess.run([sys.executable, "-c", code], check=True)
         assert check(tmp_path) == []
 
@@ -69,9 +69,9 @@ def test_what_cannot_be_opened_is_not_damaged(tmp_path, monkeypatch, number):
             assert os.strerror(number) in told.message
             assert "delete" not in told.hint
             with pytest.raises(UnreadableError, match=os.strerror(number)):
-                read_view(path) if owner is h5py else sealed_digest(path)
+                open_view(path) if owner is h5py else sealed_digest(path)
     with monkeypatch.context() as patch:
-        patch.setattr(journals, "read_view", lambda _: refuse_read(path, number))
+        patch.setattr(journals, "open_view", lambda _: refuse_read(path, number))
         with pytest.raises(UnreadableError):
             _record(tmp_path, views=1)
     assert path.exists()
@@ -93,7 +93,7 @@ def test_a_newer_layout_is_no_damage(tmp_path, monkeypatch):
         raise FormatError(f"{path}: expected version 1, got 2")
 
     with monkeypatch.context() as patch:
-        patch.setattr(journals, "read_view", newer)
+        patch.setattr(journals, "open_view", newer)
         with pytest.raises(FormatError):
             _record(tmp_path, views=1)
     assert not list(tmp_path.rglob("*.damaged*"))

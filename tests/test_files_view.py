@@ -19,7 +19,7 @@ from tests.test_files_shard import write as write_shard
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.seal import sealed_digest, stored_digest
-from tofcapture.files.view import read_depth_view, read_view, view_path, write_view
+from tofcapture.files.view import open_view, read_depth_view, view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth, View
 from tofcapture.poses import exp
 from tofcapture.rig import RangeError, Rig
@@ -81,7 +81,7 @@ def test_round_trip_is_bit_exact(tmp_path_factory, seed, ideal, truth, frames):
     view = make_view(seed, ideal=ideal, truth=truth, frames=frames)
     path = tmp_path_factory.mktemp("views") / "view-007.h5"
     write_view(path, view)
-    assert same(read_view(path), view)
+    assert same(open_view(path), view)
 
 
 def test_the_same_view_gives_the_same_bytes(tmp_path):
@@ -113,7 +113,7 @@ def test_a_killed_writer_leaves_no_view_and_the_next_one_goes_on(tmp_path):
     path.with_name("view-007.h5.partial").write_bytes(b"half a file")
     write_view(path, make_view(1))
     write_view(path, make_view(2))
-    assert same(read_view(path), make_view(2))
+    assert same(open_view(path), make_view(2))
     assert not path.with_name("view-007.h5.partial").exists()
 
 
@@ -137,7 +137,7 @@ t.write_view(pathlib.Path({str(path)!r}), t.make_view())
     assert done.returncode == -signal.SIGKILL
     assert not path.exists()
     write_view(path, make_view())
-    assert same(read_view(path), make_view())
+    assert same(open_view(path), make_view())
     assert sealed_digest(path) == stored_digest(path)
 
 
@@ -152,7 +152,7 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(h5py.Dataset, "__setitem__", full)
     with pytest.raises(OSError, match="No space"):
         write_view(path, make_view(2))
-    assert same(read_view(path), make_view(1))
+    assert same(open_view(path), make_view(1))
     assert not path.with_name("view-007.h5.partial").exists()
 
 
@@ -221,7 +221,7 @@ def test_reading_names_what_is_wrong(tmp_path, damage):
                     "another" if damage == "foreign" else 99
                 )
     with pytest.raises(DataError, match=r"view-007\.h5") as caught:
-        read_view(path)
+        open_view(path)
     expected = {"version": "version 1, got 99", "dataset": "arm/after/joints", "chunk": "/tof/raw is damaged"}
     assert expected.get(damage, "") in str(caught.value)
     assert isinstance(caught.value, FormatError) == (damage in ("foreign", "version", "dataset"))

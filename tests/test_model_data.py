@@ -30,7 +30,7 @@ from tofcapture_model.data import (
 )
 from tofcapture_model.data.raw_input import NOMINAL_CAMERA
 from tofcapture_model.geometry.maps import depth_to_normals, scale_intrinsics
-from tofcapture_model.networks.checkpoint import load_model
+from tofcapture_model.networks.checkpoint import load_checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +185,7 @@ def test_the_command_trains_on_several_datasets(dataset, other, tmp_path, capsys
     out = ["--config", str(config), "--out", str(tmp_path / "run"), "--json"]
     assert main(["train", str(dataset), str(other), *out]) == 0
     assert json.loads(capsys.readouterr().out)["steps"] == 4  # 12 + 4 frames by four
-    provenance = load_model(tmp_path / "run")[2]
+    provenance = load_checkpoint(tmp_path / "run")[2]
     assert provenance["dataset"] == str(dataset)
     digest = sha256_of(other / "manifest.json")
     assert provenance["also"] == {str(other): digest}

@@ -152,9 +152,9 @@ def test_machines_that_share_no_folder_go_on_together(dataset, tmp_path):
     assert first == second
     assert first[1]
     assert both("whole", 0)[0] == first
-    from tofcapture_model.networks.checkpoint import load_model
+    from tofcapture_model.networks.checkpoint import load_checkpoint
 
-    models = [load_model(tmp_path / f"{name}0")[0].state_dict() for name in ("stopped", "whole")]
+    models = [load_checkpoint(tmp_path / f"{name}0")[0].state_dict() for name in ("stopped", "whole")]
     assert all(torch.equal(a, b) for a, b in zip(*(m.values() for m in models), strict=True))
 
 

@@ -23,7 +23,7 @@ from tofcapture_model.inference import predict as predicting
 from tofcapture_model.inference.export import export
 from tofcapture_model.inference.predict import predict
 from tofcapture_model.networks import checkpoint
-from tofcapture_model.networks.checkpoint import load_model, save_model
+from tofcapture_model.networks.checkpoint import load_checkpoint, save_model
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 SIZE = SMALL.shape
@@ -63,7 +63,7 @@ def test_an_export_carries_its_configuration_and_its_weights_digest(exported):
     """In the metadata, where it cannot be lost; no file but the export is written."""
     told = {p.key: p.value for p in onnx.load(str(exported.with_suffix(".onnx"))).metadata_props}
     assert told["weights_sha256"] == sha256_of(exported)
-    assert told["config.toml"] == dumps_config(load_model(exported)[1])
+    assert told["config.toml"] == dumps_config(load_checkpoint(exported)[1])
     assert sorted(p.name for p in exported.parent.iterdir()) == [
         "model.onnx",
         "model.safetensors",
@@ -78,14 +78,17 @@ def test_a_torch_export_carries_the_same(tmp_path):
     export(weights, tmp_path / "model.pt2", kind="torch", size=SIZE)
     told = {"weights_sha256": "", "config.toml": ""}
     torch.export.load(str(tmp_path / "model.pt2"), extra_files=told)
-    assert told == {"weights_sha256": sha256_of(weights), "config.toml": dumps_config(load_model(weights)[1])}
+    assert told == {
+        "weights_sha256": sha256_of(weights),
+        "config.toml": dumps_config(load_checkpoint(weights)[1]),
+    }
 
 
 def test_the_backend_answers_for_its_weights_only(run, rig):  # noqa: F811
     """An export of weights that have changed since, or one that does not say of which it is, is refused; alone it answers."""
     asked = {"weights": run, "rig": rig, "backend": "onnx"}
     predict(run / "raw.npy", run / "a", **asked)
-    model, config, _ = load_model(run)
+    model, config, _ = load_checkpoint(run)
     with torch.no_grad():
         next(model.parameters()).add_(1)
     save_model(run / "model.safetensors", model, config, {})

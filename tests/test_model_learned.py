@@ -10,7 +10,7 @@ pytest.importorskip("torch")
 
 from tests.analytic import make_dataset
 from tofcapture.files.manifest import load_manifest
-from tofcapture_model.networks.checkpoint import find_model, learned_from, load_model, not_new, sentence
+from tofcapture_model.networks.checkpoint import find_model, learned_from, load_checkpoint, not_new, sentence
 
 TOLD = (["mug", "lid"], ["s001-bowl"], ["lid"])
 
@@ -76,7 +76,7 @@ def test_it_is_said_in_words(dataset):
 
 def test_the_bundled_network_tells_what_it_learned_from():
     """And those meshes that its card is measured on are not among it."""
-    learned = load_model(None)[2]["learned"]
+    learned = load_checkpoint(None)[2]["learned"]
     assert {"ycb_036_wood_block", "ycb_029_plate"} <= set(learned["objects"])
     measured = {
         "ycb_016_pear",

@@ -30,7 +30,7 @@ from tofcapture_model.geometry.decoder import TorchDecoder
 from tofcapture_model.inference import predict as predicting
 from tofcapture_model.inference.predict import predict, predict_raw, recorded
 from tofcapture_model.networks import build_model, checkpoint
-from tofcapture_model.networks.checkpoint import find_model, load_model, save_model
+from tofcapture_model.networks.checkpoint import find_model, load_checkpoint, save_model
 
 ORDER = ("right", "blocks swapped", "interleaved", "reversed", "low reversed", "pairs")
 CHANNELS = (
@@ -95,13 +95,15 @@ def saved(path, array):
 
 def test_half_precision_is_half_the_file_and_computes_in_single(weights, tmp_path):
     """Weights come back as float32, rounded to 11 bits; what float16 cannot hold is refused."""
-    model, config, provenance = load_model(weights)
+    model, config, provenance = load_checkpoint(weights)
     assert provenance == {"steps": 0}
     assert {p.dtype for p in model.parameters()} == {torch.float32}
     whole = save_model(tmp_path / "model.safetensors", model, config, provenance)
     half, full = (sum(t.nbytes for t in checkpoint.read_tensors(p)[0].values()) for p in (weights, whole))
     assert full == 2 * half
-    for a, b in zip(load_model(whole)[0].state_dict().values(), model.state_dict().values(), strict=True):
+    for a, b in zip(
+        load_checkpoint(whole)[0].state_dict().values(), model.state_dict().values(), strict=True
+    ):
         assert torch.equal(a, b)
     with torch.no_grad():
         next(model.parameters()).fill_(1e5)
@@ -283,7 +285,7 @@ def test_a_prediction_neither_copies_from_the_host_nor_looks_at_a_value(monkeypa
 def test_a_recorded_prediction_is_the_prediction(weights, tmp_path):
     """On a GPU the graph answers for a second frame as kernels launched one by one do, and as the processor does."""
     arrays = [saved(tmp_path / f"{k}.npy", table_top(NOMINAL_CAMERA, seed=k)[0]) for k in (0, 1)]
-    model, _, _ = load_model(weights)
+    model, _, _ = load_checkpoint(weights)
     model = model.to("cuda")
     frames = []
     for path in arrays:

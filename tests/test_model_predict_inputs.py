@@ -26,7 +26,7 @@ from tofcapture_model.data.raw_input import NOMINAL_CAMERA, NOMINAL_RANGE_ERRORS
 from tofcapture_model.inference import predict as predicting
 from tofcapture_model.inference.predict import Predictor, predict, predict_raw
 from tofcapture_model.networks import build_model, checkpoint
-from tofcapture_model.networks.checkpoint import find_model, load_model, save_model
+from tofcapture_model.networks.checkpoint import find_model, load_checkpoint, save_model
 
 ROOT = Path(__file__).parents[1]
 SMALL = Camera(48, 36, 38.0, 38.0, 23.5, 17.5)
@@ -281,8 +281,8 @@ def test_a_lens_is_brought_by_the_rig(weights, tmp_path):
 def test_a_predictor_loads_once_and_times_nothing(weights, monkeypatch):
     """Frame after frame the answers are those of predict_raw, in arrays of their own; tables are built once a camera."""
     loads, builds = [], []
-    real_load, real_decoder = predicting.load_model, predicting.frame_decoder
-    monkeypatch.setattr(predicting, "load_model", lambda w: loads.append(w) or real_load(w))
+    real_load, real_decoder = predicting.load_checkpoint, predicting.frame_decoder
+    monkeypatch.setattr(predicting, "load_checkpoint", lambda w: loads.append(w) or real_load(w))
     monkeypatch.setattr(predicting, "frame_decoder", lambda *a: builds.append(a) or real_decoder(*a))
     burst, info = burst_of(SMALL, 3), TofInfo("t", "", SMALL, np.zeros(3))
     predictor = Predictor(weights)
@@ -318,7 +318,7 @@ def test_bundled_is_a_name_where_a_path_is_asked_for(weights, tmp_path, monkeypa
     monkeypatch.setattr(checkpoint, "files", lambda _: weights.parents[1])
     monkeypatch.chdir(tmp_path)
     assert find_model(Path("bundled")) == find_model(None) == weights
-    assert load_model(Path("bundled"))[1] == load_model(weights)[1]
+    assert load_checkpoint(Path("bundled"))[1] == load_checkpoint(weights)[1]
     (tmp_path / "bundled").mkdir()
     assert find_model(Path("bundled")) == Path("bundled/model.safetensors")
 

@@ -34,7 +34,7 @@ from tofcapture_model.geometry.maps import rays, scale_intrinsics
 from tofcapture_model.inference.predict import predict
 from tofcapture_model.losses import error_map_loss, laplace_loss, reweighting
 from tofcapture_model.networks import build_model, training_loss
-from tofcapture_model.networks.checkpoint import budget, load_model
+from tofcapture_model.networks.checkpoint import budget, load_checkpoint
 from tofcapture_model.training.card import closest_preset
 from tofcapture_model.training.train import train
 
@@ -149,7 +149,7 @@ def test_recipes_are_the_rows_of_the_tables():
 def test_a_card_tells_of_its_run(dataset, runs):
     """Preset and differences, digest and counts of the data, the budget that the checkpoint remembers, how to go on."""
     text = (runs / "demo-1" / "README.md").read_text()
-    provenance = load_model(runs / "demo-1")[2]
+    provenance = load_checkpoint(runs / "demo-1")[2]
     assert "differences from the preset `demo`" in text
     assert "| training.seed | `0` | `1` |" in text
     assert sha256_of(dataset / "manifest.json") in text
@@ -305,7 +305,7 @@ def test_the_uncertainty_is_calibrated_on_the_validation_split(dataset, runs):
     """68 % of the errors of the first validation frames lie within the predicted sigma, and the checkpoint says so."""
     from tofcapture_model.data import FrameDataset, batched
 
-    model, _, provenance = load_model(runs / "demo-0")
+    model, _, provenance = load_checkpoint(runs / "demo-0")
     assert provenance["uncertainty"]["views"] == 2
     assert float(model.error_map.calibration) == pytest.approx(provenance["uncertainty"]["factor"])
     data, inside, total = FrameDataset(dataset, "val", frames=1), 0, 0

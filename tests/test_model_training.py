@@ -28,7 +28,7 @@ from tofcapture_model.data import FrameDataset, batched
 from tofcapture_model.evaluation.evaluate import evaluate
 from tofcapture_model.inference.predict import predict
 from tofcapture_model.networks.baselines.coarse_fine import CoarseFine
-from tofcapture_model.networks.checkpoint import load_model, read_tensors
+from tofcapture_model.networks.checkpoint import load_checkpoint, read_tensors
 from tofcapture_model.training import Group, Run
 from tofcapture_model.training.train import train
 
@@ -80,7 +80,9 @@ def test_a_stopped_run_goes_on_to_the_same_bits(dataset, tiny, trained, tmp_path
     resumed = train(tiny, dataset, out)
     assert resumed.steps == trained[1].steps
     for a, b in zip(
-        load_model(out)[0].state_dict().values(), load_model(trained[0])[0].state_dict().values(), strict=True
+        load_checkpoint(out)[0].state_dict().values(),
+        load_checkpoint(trained[0])[0].state_dict().values(),
+        strict=True,
     ):
         assert torch.equal(a, b)
     again = train(tiny, dataset, out)
@@ -111,7 +113,9 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(dataset, tiny, trained, tmp
     assert len(steps) == 1
     assert train(tiny, dataset, out).steps == trained[1].steps
     for a, b in zip(
-        load_model(out)[0].state_dict().values(), load_model(trained[0])[0].state_dict().values(), strict=True
+        load_checkpoint(out)[0].state_dict().values(),
+        load_checkpoint(trained[0])[0].state_dict().values(),
+        strict=True,
     ):
         assert torch.equal(a, b)
 
@@ -151,7 +155,7 @@ def test_fine_tuning_starts_from_weights(dataset, tiny, trained, tmp_path):
         for name in ("new", "on")
     ]
     assert first[1] < first[0]
-    provenance = load_model(tmp_path / "on")[2]
+    provenance = load_checkpoint(tmp_path / "on")[2]
     assert provenance["start_sha256"] == sha256_of(trained[1].path)
     assert provenance["learned"]["objects"] == ["scene"]
     other = replace(tiny, network=replace(tiny.network, width=5))
@@ -163,7 +167,7 @@ def test_a_packed_cache_gives_the_same_weights(dataset, tiny, trained, tmp_path)
     """Training from the flat files of `tofcapture pack` takes the very same steps."""
     pack(dataset, "train", tmp_path / "cache")
     train(tiny, dataset, tmp_path / "run", cache=tmp_path / "cache")
-    a, b = (load_model(out)[0].state_dict() for out in (tmp_path / "run", trained[0]))
+    a, b = (load_checkpoint(out)[0].state_dict() for out in (tmp_path / "run", trained[0]))
     assert all(torch.equal(a[k], b[k]) for k in a)
 
 
@@ -174,7 +178,7 @@ def test_drawn_noise_is_another_one_at_every_step_and_resumes_to_the_same_bits(d
     train(drawn, dataset, tmp_path / "two", stop_after=1)
     train(drawn, dataset, tmp_path / "two")
     train(replace(drawn, training=replace(drawn.training, seed=1)), dataset, tmp_path / "other")
-    one, two, other = (load_model(tmp_path / n)[0].state_dict() for n in ("one", "two", "other"))
+    one, two, other = (load_checkpoint(tmp_path / n)[0].state_dict() for n in ("one", "two", "other"))
     assert all(torch.equal(one[k], two[k]) for k in one)
     assert not all(torch.equal(one[k], other[k]) for k in one)
     data = FrameDataset(dataset, "train", mean=True)
@@ -241,7 +245,7 @@ def test_the_paper_s_stages_run_in_order(dataset, tiny, tmp_path):
     assert state["before"] >= sum(
         last.values()
     )  # the clock starts anew with each stage; the run's minutes are all of them
-    assert load_model(tmp_path / "run")[2]["minutes"] == round(state["before"] / 60, 2)
+    assert load_checkpoint(tmp_path / "run")[2]["minutes"] == round(state["before"] / 60, 2)
 
 
 def test_a_time_budget_ends_a_run(dataset, tiny, tmp_path):
@@ -253,15 +257,15 @@ def test_a_time_budget_ends_a_run(dataset, tiny, tmp_path):
 
 def test_checkpoints_are_strict_and_carry_their_configuration(trained, tiny, tmp_path):
     """Weights load with their configuration; a foreign file, and weights that do not fit, are refused."""
-    model, config, provenance = load_model(trained[0])
+    model, config, provenance = load_checkpoint(trained[0])
     assert config == tiny
     assert provenance["steps"] == trained[1].steps
     assert not model.training
     (tmp_path / "junk.safetensors").write_bytes(b"junk")
     with pytest.raises(FormatError, match="cannot read"):
-        load_model(tmp_path / "junk.safetensors")
+        load_checkpoint(tmp_path / "junk.safetensors")
     with pytest.raises(FormatError, match="expected tofcapture-model"):
-        load_model(trained[0] / "resume.safetensors")
+        load_checkpoint(trained[0] / "resume.safetensors")
 
 
 def test_evaluation_writes_the_agreed_results(dataset, trained, tmp_path):
@@ -370,7 +374,7 @@ def test_holes_do_not_reach_the_output(dataset, trained):
     frame = make_frame(raw, reader.info, reader.camera)
     assert frame.valid[0, 35, 45] == 0
     with torch.inference_mode():
-        found = load_model(trained[0])[0](batched(frame))
+        found = load_checkpoint(trained[0])[0](batched(frame))
     assert all(torch.isfinite(x).all() for x in found)
 
 
@@ -416,7 +420,7 @@ def test_compiled_u_nets_train_to_the_same_weights(dataset, tiny, tmp_path):
         training = replace(tiny.training, compile=compile_, validate_every=1)
         config = replace(tiny, training=training, stages=(Stage("joint", 1, 1e-3),))
         train(config, dataset, tmp_path / str(compile_))
-    plain, compiled = (load_model(tmp_path / name)[0].state_dict() for name in ("False", "True"))
+    plain, compiled = (load_checkpoint(tmp_path / name)[0].state_dict() for name in ("False", "True"))
     assert plain.keys() == compiled.keys()
     assert all(torch.allclose(plain[k], compiled[k], rtol=1e-3, atol=1e-4) for k in plain)
 

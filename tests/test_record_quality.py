@@ -10,7 +10,7 @@ from tests.test_recorder import VIEWS, Bench, _few_candidates, _record, rows
 from tofcapture.camera import Camera
 from tofcapture.devices.console import ConsoleOperator
 from tofcapture.errors import ConfigError, DeviceError
-from tofcapture.files.view import read_view, view_path
+from tofcapture.files.view import open_view, view_path
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
 from tofcapture.poses import invert, look_at, rotation_exp, transform, transform_points
 from tofcapture.record.quality import (
@@ -230,7 +230,7 @@ def test_dropped_frames_are_retaken_then_noted(tmp_path, bad, attempts, noted):
     assert all(note.startswith("view 0: ") for note in result.notes)
     assert sum("dropped" in note for note in result.notes) == noted
     assert [row.attempts for row in rows(tmp_path)] == [attempts]
-    quality = read_view(view_path(tmp_path, "mug", 0)).provenance["quality"]
+    quality = open_view(view_path(tmp_path, "mug", 0)).provenance["quality"]
     assert sum(note["check"] == "frame_drops" for note in quality["notes"]) == noted
     assert quality["frame_drops"] == noted
 
@@ -261,7 +261,7 @@ def test_quality_is_in_every_file(tmp_path):
     """The numbers are in the view files as JSON types."""
     _record(tmp_path)
     for i in range(VIEWS):
-        quality = read_view(view_path(tmp_path, "mug", i)).provenance["quality"]
+        quality = open_view(view_path(tmp_path, "mug", i)).provenance["quality"]
         assert {"saturated", "dark", "overlap", "motion_m", "frame_drops", "notes"} <= quality.keys()
 
 
@@ -281,7 +281,7 @@ def test_turns_are_asked_for_once_each(tmp_path):
     _record(tmp_path, bench, views=8, turns=3)
     asked = [step for step in bench.steps if step.startswith("turn")]
     assert asked == ["turn 0", "turn 120", "turn 240"]
-    angles = {read_view(view_path(tmp_path, "mug", i)).provenance["turn_deg"] for i in range(8)}
+    angles = {open_view(view_path(tmp_path, "mug", i)).provenance["turn_deg"] for i in range(8)}
     assert angles == {0.0, 120.0, 240.0}
     again = Turner()
     assert _record(tmp_path, again, views=8, turns=3).kept == tuple(range(8))

@@ -14,7 +14,7 @@ from tofcapture.cli import main
 from tofcapture.devices.kinematics import HOME, MODELS, forward
 from tofcapture.devices.station import Station, read_station
 from tofcapture.errors import BusyError, ConfigError, DataError, DeviceError, MotionRefused
-from tofcapture.files.view import read_view, view_path
+from tofcapture.files.view import open_view, view_path
 from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
 from tofcapture.poses import transform
 from tofcapture.record import plan as plans
@@ -129,7 +129,7 @@ def _arrays(out, scene="mug"):
     """Bytes of every array of every view."""
     found = {}
     for path in sorted((out / "views" / scene).glob("*.h5")):
-        view = read_view(path)
+        view = open_view(path)
         found[path.name] = (
             view.tof.raw.tobytes(),
             view.stereo.points.tobytes(),
@@ -151,7 +151,7 @@ def test_records_every_view_in_order(tmp_path):
     found = rows(tmp_path / "r", "mug")
     assert [row.state for row in found] == ["sealed"] * VIEWS
     for row in found:
-        view = read_view(view_path(tmp_path / "r", "mug", row.index))
+        view = open_view(view_path(tmp_path / "r", "mug", row.index))
         assert (view.scene, view.index) == ("mug", row.index)
         assert view.provenance["pose"] == row.pose
         assert view.tof.raw.shape == (FRAMES, 8, 6, 8)
@@ -399,7 +399,7 @@ def test_command_records_the_simulated_station(tmp_path, capsys):
     assert main([*words, "--out", str(tmp_path / "b")]) == 0
     capsys.readouterr()
     assert _arrays(tmp_path / "a", "calibration") == _arrays(tmp_path / "b", "calibration")
-    view = read_view(view_path(tmp_path / "a", "calibration", 0))
+    view = open_view(view_path(tmp_path / "a", "calibration", 0))
     assert view.truth is not None
     told = {
         "quality": view.provenance["quality"],

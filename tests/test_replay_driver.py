@@ -14,7 +14,7 @@ from tofcapture.devices.registry import StationContext, make_device
 from tofcapture.devices.replay import Replay, write_station
 from tofcapture.devices.station import Station, open_station, read_station
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
-from tofcapture.files.view import read_view, view_path
+from tofcapture.files.view import open_view, view_path
 from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth
 from tofcapture.poses import transform
 from tofcapture.record import plan as plans
@@ -153,16 +153,16 @@ def test_recording_again_gives_the_same_arrays(recording, tmp_path, monkeypatch,
         assert len(result.recorded) == VIEWS
         served = []
         for index in result.recorded:
-            view = read_view(view_path(again, scene, index))
+            view = open_view(view_path(again, scene, index))
             same = [
                 n
                 for n in range(VIEWS)
-                if np.array_equal(read_view(view_path(recording, scene, n)).tof.raw, view.tof.raw)
+                if np.array_equal(open_view(view_path(recording, scene, n)).tof.raw, view.tof.raw)
             ]
             served += same
             if order == "joints":
                 assert same == [index]
-            before = arrays(read_view(view_path(recording, scene, same[0])))
+            before = arrays(open_view(view_path(recording, scene, same[0])))
             for name, array in arrays(view).items():
                 np.testing.assert_array_equal(array, before[name], err_msg=name)
         assert sorted(served) == list(range(VIEWS))
@@ -199,7 +199,7 @@ def test_between_views_there_is_nothing(recording):
 def test_frames_and_scenes_that_were_not_recorded(recording):
     """Fewer frames are the first ones; more frames, or another scene, were not recorded."""
     with opened(recording) as (arm, tof, _, operator):
-        view = read_view(view_path(recording, "box", 1))
+        view = open_view(view_path(recording, "box", 1))
         operator.place("box")
         arm.move_to(view.arm_before.joints)
         np.testing.assert_array_equal(tof.capture(1).raw, view.tof.raw[:1])
@@ -213,7 +213,7 @@ def test_frames_and_scenes_that_were_not_recorded(recording):
 def test_state_after_the_exposures(recording):
     """Before the exposures the arm is where it was before them, afterwards where it was after them; placing again changes nothing."""
     with opened(recording) as (arm, tof, stereo, operator):
-        view = read_view(view_path(recording, "mug", 2))
+        view = open_view(view_path(recording, "mug", 2))
         operator.place("mug")
         assert arm.move_to(view.arm_before.joints).time_ns == view.arm_before.time_ns
         tof.capture(FRAMES)
@@ -230,7 +230,7 @@ def test_by_number_it_ends(recording):
             for _ in range(2):
                 arm.move_to(HOME)
             np.testing.assert_array_equal(
-                tof.capture(FRAMES).raw, read_view(view_path(recording, "mug", index)).tof.raw
+                tof.capture(FRAMES).raw, open_view(view_path(recording, "mug", index)).tof.raw
             )
         with pytest.raises(DeviceError, match="no view after 2"):
             arm.move_to(HOME)

@@ -13,7 +13,7 @@ from tofcapture.devices.kinematics import HOME, MODELS, forward
 from tofcapture.devices.registry import StationContext, make_device
 from tofcapture.devices.station import open_station
 from tofcapture.errors import ConfigError, MotionRefused
-from tofcapture.files.view import read_view, view_path
+from tofcapture.files.view import open_view, view_path
 from tofcapture.record import recorder
 from tofcapture.record.plan import plan_scene, prove
 from tofcapture.record.recorder import record
@@ -100,7 +100,7 @@ def test_recording_completes_after_a_protective_stop(emulator, tmp_path, monkeyp
     with open_station(file, allow_motion=True) as station:
         result = record(station, "mug", recording, views=1, frames=1)
     assert result.failed == ()
-    view = read_view(view_path(recording, "mug", 0))
+    view = open_view(view_path(recording, "mug", 0))
     np.testing.assert_allclose(view.arm_before.joints, result.plan.views[0].joints, atol=4e-4)
     assert view.truth.target.any()
 

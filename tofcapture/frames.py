@@ -167,3 +167,8 @@ class View:
     #: Strings and numbers: versions, seed, plan digest, UTC time ...
     provenance: Mapping[str, Any] = field(default_factory=dict)
     truth: Truth | None = None  #: Only from a simulator.
+
+    def __repr__(self) -> str:
+        frames, *sizes = self.tof.raw.shape
+        shapes = " x ".join(map(str, sizes)), " x ".join(map(str, self.stereo.points.shape[:2]))
+        return f"View({self.scene} {self.index}: {frames} frames of {shapes[0]}, stereo {shapes[1]})"

@@ -1,4 +1,4 @@
-"""The only doors to numba and open3d.
+"""Load late: the only doors to numba and open3d, and the public names of packages.
 
 Loops that numpy cannot fuse are compiled when they are first called and kept on disk.
 
@@ -16,7 +16,7 @@ import functools
 import importlib
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import Any, TypeVar, cast
 
@@ -100,3 +100,31 @@ def load_open3d() -> ModuleType:
         raise ConfigError(
             f"open3d is needed here and does not load: {err}", hint="pip install 'tofcapture[capture]'"
         ) from err
+
+
+def face(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Make the ``__getattr__`` and the ``__dir__`` of a package whose public names are imported when they are asked for.
+
+    ``homes`` says by public name where it is defined: ``room.module``, or ``room.module:Name`` where it has another name there.
+    """
+
+    def found(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        module, _, thing = homes[name].partition(":")
+        return getattr(importlib.import_module(f"{package}.{module}"), thing or name)
+
+    return found, lambda: sorted({*vars(sys.modules[package]), *homes})
+
+
+def called(module: str, home: str) -> None:
+    """Let a module that is being imported be called as a public function of its name: importing the one would hide the other.
+
+    ``home`` is ``tofcapture.record.recorder:record`` for ``tofcapture.record``.
+    """
+    where, _, name = home.partition(":")
+
+    def call(_module: ModuleType, *given: Any, **named: Any) -> Any:
+        return getattr(importlib.import_module(where), name)(*given, **named)
+
+    sys.modules[module].__class__ = type("CalledModule", (ModuleType,), {"__call__": call})

@@ -6,7 +6,7 @@
         for index, result in pool.run(function, [(a, b), (c, d)]):
             ...
 
-Every worker is spawned and computes with one thread: sums are added in one order, and workers do not fight over cores. A task
+Every worker is spawned, without running the script that opened the pool again, and computes with one thread: sums are added in one order, and workers do not fight over cores. A task
 whose worker is killed is tried again. Workers end with the pool, and with the process that opened it, however that ends.
 """
 
@@ -15,6 +15,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +23,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
-from types import TracebackType
+from types import ModuleType, TracebackType
 from typing import Any, Self
 
 from tofcapture.errors import TofError
@@ -157,7 +158,7 @@ class Pool:
                     self._jobs, self._context, _begin, (self._lifeline, self._pinned)
                 )
             try:
-                with _environment():
+                with _environment(), _without_script(function):
                     return self._executor.submit(_work, function, arguments), self._executor
             except BrokenProcessPool:  # a worker died while it had nothing to do
                 self._forget(self._executor)
@@ -177,6 +178,21 @@ def _environment() -> Iterator[None]:
     finally:
         for name, value in before.items():
             os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+
+
+@contextmanager
+def _without_script(function: Callable[..., Any]) -> Iterator[None]:
+    """Keep a process that is started now from running the user's script again, which may have no guard against that.
+
+    Only a function that is defined in the script itself needs it there.
+    """
+    script = sys.modules["__main__"]
+    if function.__module__ != "__main__":
+        sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
 
 
 def _begin(lifeline: Connection, pinned: bool) -> None:
@@ -204,6 +220,5 @@ def _work(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
 def _died(times: int) -> TofError:
     return TofError(
         f"the worker process died, {times} times",
-        "out of memory? use fewer processes: --jobs 1; see also dmesg. A script that starts workers needs: "
-        "if __name__ == '__main__'",
+        "out of memory? use fewer processes: --jobs 1; see also dmesg",
     )

@@ -273,7 +273,7 @@ def dumps_rig(rig: Rig) -> str:
     return str(tomli_w.dumps(rig_to_dict(rig)))
 
 
-def load_rig(path: Path) -> Rig:
+def load_rig(path: str | Path) -> Rig:
     """Read ``rig.toml``.
 
     Raises :class:`ConfigError`: missing, not TOML, or not a rig.

@@ -1,28 +1,30 @@
 """Estimate 480x360 depth and normals jointly from ToF raw data.
 
-What people call is ``load_model``, ``FrameDataset``, ``train`` and ``evaluate``. Importing this package does not import torch.
+::
+
+    model = tofcapture_model.load_model("bundled")
+    depth = model("recording/views/mug/view-000.h5").depth
+
+What people call is named here. Importing this package does not import torch.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from tofcapture.libraries import face as _face
 
 if TYPE_CHECKING:
     from tofcapture_model.data import FrameDataset
     from tofcapture_model.evaluation.evaluate import evaluate
-    from tofcapture_model.networks.checkpoint import load_model
+    from tofcapture_model.inference.predict import Predictor
     from tofcapture_model.training.train import train
 
-__all__ = ["FrameDataset", "evaluate", "load_model", "train"]
+    load_model = Predictor
 
+__all__ = ["FrameDataset", "evaluate", "load_model", "train"]
 _HOMES = {
     "FrameDataset": "data",
     "evaluate": "evaluation.evaluate",
-    "load_model": "networks.checkpoint",
+    "load_model": "inference.predict:Predictor",
     "train": "training.train",
 }
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+__getattr__, __dir__ = _face(__name__, _HOMES)

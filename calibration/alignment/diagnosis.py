@@ -17,7 +17,7 @@ from calibration.registration.clouds import WORKING_DEPTH, Cloud
 from calibration.registration.gate import Refusal, check_registration, register
 from calibration.registration.pairs import Pair
 from tofcapture.errors import ConfigError, DataError, QualityError, TofError
-from tofcapture.files.view import read_view
+from tofcapture.files.view import open_view
 from tofcapture.frames import View
 from tofcapture.pool import Pool
 from tofcapture.poses import Float64, invert, rotation_angle
@@ -60,7 +60,7 @@ def explained(
     """
     failed = [p for p, refusal in zip(pairs, error.refusals, strict=True) if refusal is not None]
     for pair in failed[:TRIED]:
-        if (found := unusable(read_view(recording / pair.name), pair.name)) is not None:
+        if (found := unusable(open_view(recording / pair.name), pair.name)) is not None:
             return found
     full = [p for p in failed if len(p.source) and len(p.target)][:TRIED]
     with Pool(1, pinned=True) as pool:

@@ -20,7 +20,7 @@ from calibration.alignment.views import TERMS, joint_view_of
 from calibration.range_error.terms import Terms, jackknife
 from calibration.registration.pairs import Pair
 from tofcapture.errors import ConfigError
-from tofcapture.files.view import read_view
+from tofcapture.files.view import open_view
 from tofcapture.poses import Float64, invert, rotation_angle, transform_points
 from tofcapture.rig import RangeError, Rig, range_error_table
 
@@ -57,7 +57,7 @@ def apply_method(
     if method == "weighted":
         extra = _uncertainty(*_left_out(solution, weighted))
     if method == "joint":
-        views = [joint_view_of(read_view(recording / pairs[i].name)) for i in solution.used]
+        views = [joint_view_of(open_view(recording / pairs[i].name)) for i in solution.used]
         joint = joint_icp(views, averaged)
         found["joint"] = joint.T_tof_stereo
         hz = views[0].modulation_hz

@@ -17,7 +17,7 @@ from tofcapture.camera import Camera
 from tofcapture.cli.kit import Outcome
 from tofcapture.devices.clearance import workcell_of
 from tofcapture.errors import DataError
-from tofcapture.files.view import read_view
+from tofcapture.files.view import open_view
 from tofcapture.poses import Float64, invert
 from tofcapture.record.quality import SECTORS, board_pose, coverage, meter
 
@@ -81,7 +81,7 @@ def recorded_poses(recording: Path) -> tuple[list[Float64], Camera]:
             f"{path}: cannot read where the board stands: {err}", hint="record writes it beside the views"
         ) from err
     T_base_board, poses = board_pose(workcell.board, workcell.board_normal), []
-    for view in map(read_view, calibration_views(recording)):
+    for view in map(open_view, calibration_views(recording)):
         poses.append(invert(view.arm_before.T_base_flange @ view.rig.T_flange_tof) @ T_base_board)
         camera = view.tof.info.camera
     return poses, camera

@@ -31,24 +31,24 @@ IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp"}
 def read_views(recording: Path, what: str) -> Iterator[tuple[Path, View]]:
     """Read the calibration views of a recording one by one, with progress; :class:`DataError` where there are none."""
     from calibration.registration.pairs import calibration_views
-    from tofcapture.files.view import read_view
+    from tofcapture.files.view import open_view
 
     paths = calibration_views(recording)
     with kit.progress() as progress:
         for i, path in enumerate(paths):
             progress(what, i, len(paths))
-            yield path, read_view(path)
+            yield path, open_view(path)
         progress(what, len(paths), len(paths))
 
 
 def believed_rig(recording: Path, given: Path | None = None) -> Rig:
     """Return the rig to start from: the given one, what was aligned or calibrated before, else what the first view says."""
     from calibration.registration.pairs import calibration_views
-    from tofcapture.files.view import read_view
+    from tofcapture.files.view import open_view
     from tofcapture.rig import load_rig
 
     path = given or recording / "rig.toml"
-    return load_rig(path) if given or path.exists() else read_view(calibration_views(recording)[0]).rig
+    return load_rig(path) if given or path.exists() else open_view(calibration_views(recording)[0]).rig
 
 
 def saved(args: argparse.Namespace, name: str, data: dict[str, Any], rig: Rig, text: str) -> Outcome:

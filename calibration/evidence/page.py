@@ -305,7 +305,7 @@ def sample_recording(recording: Path, evidence: Mapping[str, Any], progress: Pro
     DataError
         No views, or unreadable ones.
     """
-    from tofcapture.files.view import read_view
+    from tofcapture.files.view import open_view
 
     T_stereo_tof = invert(check_transform(evidence["T_tof_stereo"], "evidence: T_tof_stereo"))
     paths = calibration_views(recording)
@@ -315,7 +315,7 @@ def sample_recording(recording: Path, evidence: Mapping[str, Any], progress: Pro
     parts: list[Samples] = []
     for i in some:
         progress("evidence page", len(parts), len(some))
-        parts.append(_sample(read_view(good[i]), T_stereo_tof, evidence))
+        parts.append(_sample(open_view(good[i]), T_stereo_tof, evidence))
     joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _ARRAYS}
     poses, outlines = [T for p in parts for T in p.poses], [o for p in parts for o in p.outlines]
     return Samples(camera=parts[0].camera, **joined, poses=poses, outlines=outlines)

@@ -297,9 +297,9 @@ def recording_pairs(
 
 
 def _seen(path: Path) -> _Seen:
-    from tofcapture.files.view import read_view
+    from tofcapture.files.view import open_view
 
-    view = read_view(path)
+    view = open_view(path)
     held = rim_cloud(stereo_rims(view.stereo.points), np.zeros(3))
     hand = view.arm_before.T_base_flange
     return _Seen(hand, hand @ view.rig.T_flange_stereo, held + stereo_cloud(view.stereo), held.points)

@@ -11,7 +11,7 @@ import numpy as np
 from calibration.registration.clouds import Cloud, stereo_cloud, surface_points, tof_depth
 from calibration.registration.rims import REPEAT, rim_cloud, stereo_rims, tof_rims
 from tofcapture.errors import DataError
-from tofcapture.files.view import find_views, read_view
+from tofcapture.files.view import find_views, open_view
 from tofcapture.frames import View
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig
@@ -65,7 +65,7 @@ def pair_of(view: View, name: str, sha256: str) -> Pair:
 
 def load_pair(recording: Path, path: Path) -> Pair:
     """Read a view file and reduce it; :class:`DataError` names a file that is unreadable or damaged."""
-    view = read_view(path)
+    view = open_view(path)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return pair_of(view, path.relative_to(recording).as_posix(), digest)

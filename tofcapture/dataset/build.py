@@ -69,9 +69,9 @@ class BuildResult:
 
 
 def build_dataset(
-    recordings: Sequence[Path],
-    out: Path,
-    rig_path: Path | None = None,
+    recordings: str | Path | Sequence[str | Path],
+    out: str | Path,
+    rig_path: str | Path | None = None,
     *,
     true_rig: bool = False,
     config: SampleConfig | None = None,
@@ -87,7 +87,7 @@ def build_dataset(
     Parameters
     ----------
     recordings
-        Folders that ``record`` filled; views of the board are left out.
+        Folder or folders that ``record`` filled; views of the board are left out.
     out
         The dataset's folder.
     rig_path
@@ -124,7 +124,8 @@ def build_dataset(
     if not 1 <= index <= count:
         raise ConfigError(f"--part: expected I/N with 1 <= I <= N, got {index}/{count}", hint="--part 2/8")
     check_writable(out, "name another folder: --out")
-    tasks = scene_tasks(recordings, out, rig_path, true_rig=true_rig, config=config)
+    folders = [recordings] if isinstance(recordings, str | Path) else recordings
+    tasks = scene_tasks(folders, out, rig_path, true_rig=true_rig, config=config)
     mine = [] if finish else tasks[index - 1 :: count]
     outcomes = _run(mine, engine, default_jobs() if jobs is None else jobs, scheduler, progress)
     others = [t for t in tasks if t.scene not in outcomes]
@@ -140,9 +141,9 @@ def default_jobs() -> int:
 
 
 def scene_tasks(
-    recordings: Sequence[Path],
-    out: Path,
-    rig_path: Path | None = None,
+    recordings: Sequence[str | Path],
+    out: str | Path,
+    rig_path: str | Path | None = None,
     *,
     true_rig: bool = False,
     config: SampleConfig | None = None,

@@ -23,7 +23,7 @@ from tofcapture.devices.faults import StopLatch
 from tofcapture.devices.kinematics import HOME, MODELS, ArmModel, check_joints, forward
 from tofcapture.devices.registry import ROLES, StationContext, check_keys
 from tofcapture.errors import ConfigError, DataError, DeviceError
-from tofcapture.files.view import check_scene_name, find_views, read_view, view_number, view_path
+from tofcapture.files.view import check_scene_name, find_views, open_view, view_number, view_path
 from tofcapture.frames import ArmInfo, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth, View
 from tofcapture.poses import Float64
 from tofcapture.rig import dumps_rig
@@ -118,7 +118,7 @@ class Replay:
         path = view_path(self.recording, scene, index)
         if self._cached is None or self._cached[0] != path:
             try:
-                self._cached = (path, read_view(path))
+                self._cached = (path, open_view(path))
             except DataError as err:
                 raise DeviceError(f"replay: {err.message}", hint=err.hint) from err
         return self._cached[1]

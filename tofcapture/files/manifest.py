@@ -99,7 +99,7 @@ class Manifest:
         return {k: e for k, e in sorted(self.scenes.items()) if e.split == name}
 
 
-def manifest_path(dataset: Path) -> Path:
+def manifest_path(dataset: str | Path) -> Path:
     """Return where the manifest of a dataset lies."""
     return Path(dataset) / "manifest.json"
 
@@ -118,7 +118,7 @@ def write_manifest(dataset: Path, manifest: Manifest) -> Path:
     return path
 
 
-def load_manifest(dataset: Path) -> Manifest:
+def load_manifest(dataset: str | Path) -> Manifest:
     """Read ``DATASET/manifest.json``.
 
     :class:`DataError` when it is missing, not JSON, or changed after it was written; :class:`FormatError` when it is of another

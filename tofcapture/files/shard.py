@@ -2,7 +2,7 @@
 
 ::
 
-    with ShardReader(dataset / "shards/mug.h5") as shard:
+    with open_shard(dataset / "shards/mug.h5") as shard:
         raw = shard.raw(view=3, frame=0)               # (8, 180, 240)
         gt = shard.ground_truth(view=3, scale=2)       # depth, normals, mask at 360 x 480
         good = gt.mask == 0
@@ -15,13 +15,14 @@
 
 from __future__ import annotations
 
+import operator
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, SupportsIndex
 
 import h5py
 import numpy as np
@@ -142,6 +143,13 @@ class Sample:
     truth: ExactMaps | None = None
 
 
+def open_shard(path: str | Path) -> ShardReader:
+    """Open a shard and look at it: what is wrong with it is raised here, as :class:`ShardReader` says."""
+    shard = ShardReader(path)
+    shard.scene  # noqa: B018  the whole file is hashed here
+    return shard
+
+
 def scales_text(scales: Sequence[int]) -> str:
     """Say scales in words: ``1x and 2x``."""
     *others, last = (f"{scale}x" for scale in scales)
@@ -151,7 +159,8 @@ def scales_text(scales: Sequence[int]) -> str:
 class ShardReader:
     """Reads one shard; opens on first use, keeps its handles, pickles as its path.
 
-    A reader in use may cross a fork: HDF5 reads by position, so that processes share no offset.
+    A reader in use may cross a fork: HDF5 reads by position, so that processes share no offset. It is a sequence of the scene's
+    views, each a :class:`Sample`. Views and frames are counted from the end where they are negative.
 
     Parameters
     ----------
@@ -213,9 +222,38 @@ class ShardReader:
 
     def _row(self, name: str, *index: int) -> Array:
         dataset = self._dataset(name)
-        if not all(0 <= i < n for i, n in zip(index, dataset.shape, strict=False)):
+        if not all(-n <= i < n for i, n in zip(index, dataset.shape, strict=False)):
             raise DataError(f"{self.path}: /{name} has shape {dataset.shape}, asked for {index}")
-        return read(dataset, self.path, index)
+        return read(dataset, self.path, tuple(i % n for i, n in zip(index, dataset.shape, strict=False)))
+
+    def __repr__(self) -> str:
+        held = "not opened yet" if self._file is None else f"{self.scene}, {self.views} views"
+        return f"ShardReader({str(self.path)!r}, {held})"
+
+    def __len__(self) -> int:
+        return self.views
+
+    def __bool__(self) -> bool:
+        return True  # whatever it holds; asking must not open the file
+
+    def __iter__(self) -> Iterator[Sample]:
+        return (self[i] for i in range(self.views))
+
+    def __getitem__(self, view: SupportsIndex) -> Sample:
+        at = operator.index(view)
+        if not -self.views <= at < self.views:
+            raise IndexError(f"{self!r}: no view {at}")
+        return Sample(
+            index=self.index(at),
+            raw=self.burst(at),
+            celsius=self._row("tof/celsius", at),
+            time_ns=self._row("tof/time_ns", at),
+            tof=self.tof(at),
+            native_depth=self.native(at),
+            ground_truth={scale: self.ground_truth(at, scale) for scale in self.scales},
+            T_base_tof=self.T_base_tof(at),
+            truth=self.truth(at),
+        )
 
     @cached_property
     def scene(self) -> str:
@@ -263,6 +301,10 @@ class ShardReader:
     def raw(self, view: int, frame: int) -> Array:
         """(K, H, W) phase images of one frame, the sensor's integers."""
         return self._row("tof/raw", view, frame)
+
+    def burst(self, view: int) -> Array:
+        """(F, K, H, W) phase images of all frames of a view."""
+        return self._row("tof/raw", view)
 
     def celsius(self, view: int, frame: int) -> float:
         """Sensor temperature of one frame; NaN: not told."""

@@ -3,7 +3,7 @@
 ::
 
     digest = write_view(view_path(recording, "mug", 7), view)
-    view = read_view(recording / "views/mug/view-007.h5")
+    view = open_view(recording / "views/mug/view-007.h5")
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def _arrays(view: View) -> dict[str, Array]:
     return {path: np.asarray(a) for path, a in arrays.items()}
 
 
-def write_view(path: Path, view: View) -> str:
+def write_view(path: str | Path, view: View) -> str:
     """Write a view, verify it byte by byte, seal it read-only under its name.
 
     Killed at any moment it leaves either no file of that name or a whole one. The same view gives the same bytes.
@@ -212,7 +212,7 @@ def _write(file: h5py.File, view: View, arrays: dict[str, Array]) -> None:
         create(file, VIEW[name], data.shape, data.dtype)[...] = data
 
 
-def read_view(path: Path) -> View:
+def open_view(path: str | Path) -> View:
     """Read a view back, bit by bit what was written.
 
     Raises
@@ -227,13 +227,13 @@ def read_view(path: Path) -> View:
         return _read(file, path, fetch(file, VIEW["stereo/points"], path))
 
 
-def read_depth_view(path: Path) -> tuple[View, NDArray[np.float32]]:
-    """Read a view without x and y of its point map, which are two thirds of the work; raises as :func:`read_view` does.
+def read_depth_view(path: str | Path) -> tuple[View, NDArray[np.float32]]:
+    """Read a view without x and y of its point map, which are two thirds of the work; raises as :func:`open_view` does.
 
     Returns
     -------
     view
-        As :func:`read_view`, but every point of the map is NaN.
+        As :func:`open_view`, but every point of the map is NaN.
     depth
         (SH, SW) z of the map, stereo frame, metres.
     """

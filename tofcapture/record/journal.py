@@ -19,7 +19,7 @@ from typing import Any
 from tofcapture.errors import ConfigError, DataError, UnreadableError
 from tofcapture.files.disk import Database, is_there
 from tofcapture.files.seal import replacing, sealed_digest, stored_digest
-from tofcapture.files.view import read_view, view_number, view_path
+from tofcapture.files.view import open_view, view_number, view_path
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS views (
@@ -217,7 +217,7 @@ def _adopt(journal: Journal, path: Path, scene: str, index: int) -> str:
     sha256 = ""
     try:
         sha256 = sealed_digest(path)
-        view = read_view(path)
+        view = open_view(path)
     except DataError as err:
         if isinstance(err, UnreadableError) or (sha256 and stored_digest(path)):
             raise  # its bytes are those that were sealed, or nobody knows: that is no damage

@@ -16,7 +16,7 @@ from tofcapture import __version__
 from tofcapture.devices.clearance import route, workcell_of
 from tofcapture.devices.contract import check_burst, check_points, check_state, check_tof_info
 from tofcapture.devices.faults import ArmFault
-from tofcapture.devices.station import Station
+from tofcapture.devices.station import Station, open_station
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused, MotionStopped
 from tofcapture.files.seal import write_text
 from tofcapture.files.view import view_path, write_view
@@ -53,7 +53,7 @@ class RecordResult:
 
 
 def record(
-    station: Station,
+    station: Station | str | Path | None,
     scene: str,
     recording: str | Path,
     views: int = 25,
@@ -71,7 +71,8 @@ def record(
     Parameters
     ----------
     station, scene, recording
-        Open devices; a name, ``calibration`` for views of the board; a folder, made when missing.
+        Open devices, or their ``station.toml``, or ``None``: the simulated ones; a name, ``calibration`` for views of the board; a
+        folder, made when missing. Only a station that was opened with leave moves a real arm.
     views, frames, turns
         Views of the scene, ToF frames of each burst, ways in which the operator is asked to put the object.
     progress
@@ -97,6 +98,9 @@ def record(
     Stopped
         The observer, ``tofcapture stop``, or a stop of the arm, ended the run.
     """
+    if station is None or isinstance(station, str | Path):
+        with open_station(None if station is None else Path(station)) as opened:
+            return record(opened, scene, recording, views, frames, progress, observer, turns, retake)
     if frames < 1:
         raise ConfigError(f"frames: expected at least 1, got {frames}")
     recording, observer = Path(recording), observer or Observer()

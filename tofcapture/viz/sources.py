@@ -15,7 +15,7 @@ from tofcapture.errors import DataError, TofError
 from tofcapture.files.layout import BOARD_SCENE
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.shard import ShardReader
-from tofcapture.files.view import find_views, read_view
+from tofcapture.files.view import find_views, open_view
 from tofcapture.frames import View
 from tofcapture.ops.phase import Decoder
 from tofcapture.poses import Float64, transform_points
@@ -38,12 +38,12 @@ def recording_source(recording: Path) -> Source:
     rig, arm = rig_of(recording, paths[0]), arm_of(recording)
     names = [f"{p.parent.name} {number_of(p)}" for p in paths]
     title = f"recording {recording.resolve().name}"
-    return Source(title, names, lambda i: view_shot(read_view(paths[i]), rig, arm), rig)
+    return Source(title, names, lambda i: view_shot(open_view(paths[i]), rig, arm), rig)
 
 
 def view_source(path: Path) -> Source:
     """The one shot of a view file, with ``rig.toml`` and ``station.toml`` of the recording that it lies in."""
-    folder, view = path.resolve().parent.parent, read_view(path)
+    folder, view = path.resolve().parent.parent, open_view(path)
     home = folder.parent if folder.name == "views" else path.parent
     rig = rig_of(home, path) if folder.name == "views" else view.rig
     name = f"{view.scene} {view.index}"
@@ -112,7 +112,7 @@ def number_of(path: Path) -> int:
 def rig_of(recording: Path, view: Path) -> Rig:
     """Rig that ``align`` has written, otherwise that of a view."""
     aligned = recording / "rig.toml"
-    return load_rig(aligned) if aligned.exists() else read_view(view).rig
+    return load_rig(aligned) if aligned.exists() else open_view(view).rig
 
 
 def arm_of(recording: Path) -> ArmModel | None:

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from tofcapture import open_dataset
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.cache import PackedScene, open_cache
 from tofcapture.files.layout import MaskBit
-from tofcapture.files.manifest import load_manifest
 from tofcapture.files.shard import ShardReader
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import Decoder, TapNoise, photon_transfer
@@ -167,11 +167,11 @@ def open_scenes(folder: Path, split: str, cache: Path | None = None) -> dict[str
 
     :class:`DataError`: the manifest or the cache is missing, damaged, stale or of another split.
     """
-    entries = load_manifest(folder).split(split)
+    shards = open_dataset(folder, split).shards
     if cache is None:
-        return {name: ShardReader(Path(folder) / entry.path, entry.sha256) for name, entry in entries.items()}
+        return dict(shards)
     packed = open_cache(cache, folder)
-    if packed.keys() != entries.keys():
+    if packed.keys() != shards.keys():
         raise DataError(
             f"{cache}: is not of the split {split}", hint=f"tofcapture pack {folder} --split {split}"
         )
@@ -213,7 +213,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
 
     def __init__(
         self,
-        folder: str | Path | Sequence[Path],
+        folder: str | Path | Sequence[str | Path],
         split: str,
         size: Sequence[int] = (),
         *,
@@ -224,7 +224,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         cache_bytes: float = 0,
         cache: Path | None = None,
     ) -> None:
-        folders = [Path(folder)] if isinstance(folder, str | Path) else list(folder)
+        folders = [Path(folder)] if isinstance(folder, str | Path) else [Path(each) for each in folder]
         if cache and len(folders) > 1:
             raise ConfigError(
                 f"expected one dataset with the cache {cache}, got {len(folders)}",

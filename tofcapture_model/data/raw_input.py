@@ -336,7 +336,7 @@ def _check_counts(raw: NDArray[np.float64], info: TofInfo, where: str) -> None:
 def _from_h5(path: Path, view: int) -> RawInput:
     from tofcapture.files.hdf import open_h5
     from tofcapture.files.shard import ShardReader
-    from tofcapture.files.view import read_view
+    from tofcapture.files.view import open_view
 
     try:
         with open_h5(path) as file:
@@ -348,7 +348,7 @@ def _from_h5(path: Path, view: int) -> RawInput:
             f"cannot read the file: {err.message}", hint=err.hint if path.suffix == ".h5" else _KINDS
         ) from err
     if kind != "tofcapture-shard":
-        found = read_view(path)
+        found = open_view(path)
         return RawInput(found.tof.raw, found.tof.celsius, found.tof.info, found.rig.tof, str(path))
     with ShardReader(path) as shard:
         if not 0 <= view < shard.views:

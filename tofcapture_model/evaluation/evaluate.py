@@ -19,7 +19,7 @@ from tofcapture_model.evaluation.metrics import Score
 from tofcapture_model.frame import Frame, frame_to, target_to
 from tofcapture_model.networks import Model
 from tofcapture_model.networks.baselines import sensor_estimate
-from tofcapture_model.networks.checkpoint import find_model, load_model, not_new, origin, sentence
+from tofcapture_model.networks.checkpoint import find_model, load_checkpoint, not_new, origin, sentence
 from tofcapture_model.networks.joint import JointModel
 
 FORMAT, VERSION = "tofcapture-results", 1
@@ -111,9 +111,9 @@ def _ratios(model: JointModel, data: FrameDataset, sample: SampleId, device: tor
 
 
 def evaluate(
-    dataset: Path,
-    weights: Path | None,
-    out: Path,
+    dataset: str | Path,
+    weights: str | Path | None,
+    out: str | Path,
     *,
     split: str = "test",
     frames: int = 1,
@@ -128,7 +128,7 @@ def evaluate(
     dataset
         Folder with ``manifest.json``.
     weights
-        Checkpoint; ``None``: the bundled one.
+        Checkpoint; ``None`` or ``bundled``: the bundled one.
     out
         ``results.json``, written atomically.
     split
@@ -151,8 +151,9 @@ def evaluate(
     ConfigError
         ``out`` cannot be written, or no scene of the split begins so.
     """
+    dataset = Path(dataset)
     expect_writable(Path(out))
-    model, config, provenance = load_model(weights)
+    model, config, provenance = load_checkpoint(weights)
     model.to(device)
     data = FrameDataset(dataset, split, frames=frames)
     measured = take_scenes(data, split, scenes)

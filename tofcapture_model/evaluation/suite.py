@@ -30,7 +30,7 @@ from tofcapture_model.evaluation.tables import SUITES, write_tables
 from tofcapture_model.frame import Frame, Target, frame_to, target_to
 from tofcapture_model.networks import Model
 from tofcapture_model.networks.baselines import Baseline, lf2, sensor_estimate
-from tofcapture_model.networks.checkpoint import budget, find_model, load_model, origin, sentence
+from tofcapture_model.networks.checkpoint import budget, find_model, load_checkpoint, origin, sentence
 
 FREE = {"sensor": sensor_estimate, "lf2": lf2.estimate}
 """Methods without parameters; they take part in every suite."""
@@ -301,7 +301,7 @@ def measure_runs(
     trained: dict[str, Any] = {}
     by_name: dict[str, list[dict[str, Any]]] = {}
     for nth, (name, i, path) in enumerate(runs, 1):
-        model, config, provenance = load_model(path)
+        model, config, provenance = load_checkpoint(path)
         digest = sha256_of(path)
         trained[f"{name}#{i}"] = {
             "weights": str(path),
@@ -334,7 +334,7 @@ def _expect_fit(runs: Sequence[tuple[str, Path]], data: FrameDataset, target_dev
     frame = frame_to(batched(data.frame(data.samples[0])), target_device)
     for name, path in runs:
         try:
-            load_model(path)[0].to(target_device)(frame)
+            load_checkpoint(path)[0].to(target_device)(frame)
         except ConfigError as err:
             raise ConfigError(f"{name}={path}: {err.message}", hint=err.hint) from err
 

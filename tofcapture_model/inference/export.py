@@ -17,7 +17,7 @@ from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Config, dumps_config, loads_config
 from tofcapture_model.frame import Estimate, Frame
 from tofcapture_model.geometry.maps import LENS, PINHOLE, with_lens
-from tofcapture_model.networks.checkpoint import find_model, load_model
+from tofcapture_model.networks.checkpoint import find_model, load_checkpoint
 
 OUTPUTS = ("depth_2x", "normals_2x", "error_2x")
 DIGEST, CONFIG = "weights_sha256", "config.toml"
@@ -100,7 +100,7 @@ def export(
         The exported model answers differently.
     """
     _expect_file(out, kind)
-    model, config, _ = load_model(weights)
+    model, config, _ = load_checkpoint(weights)
     told = {DIGEST: sha256_of(find_model(weights)), CONFIG: dumps_config(config)}
     flat = Flat(model).eval()
     for parameter in flat.parameters():

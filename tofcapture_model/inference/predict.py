@@ -24,7 +24,7 @@ from tofcapture_model.data.raw_input import RawInput, expect_finite, read_input,
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
 from tofcapture_model.geometry.decoder import Taps, TorchDecoder
 from tofcapture_model.inference.prediction import Prediction, write_prediction
-from tofcapture_model.networks.checkpoint import find_model, load_model
+from tofcapture_model.networks.checkpoint import find_model, load_checkpoint
 from tofcapture_model.networks.joint import JointModel
 
 Float32 = NDArray[np.float32]
@@ -237,7 +237,7 @@ def recorded(
 
 def torch_model(weights: Path | None, device: str) -> tuple[Ask, str]:
     """Load a network to compute as it was trained: in bfloat16 if that is how it learned, and where the device has it. With its kind."""
-    model, config, _ = load_model(weights)
+    model, config, _ = load_checkpoint(weights)
     model = model.to(device)
     kind = torch.device(device).type
     half = config.training.precision == "bfloat16" and has_bfloat16(kind)

@@ -65,7 +65,7 @@ def save_model(
 ) -> Path:
     """Write weights, configuration and provenance, any JSON object, to a ``.safetensors``; the configuration also beside it as ``.toml``.
 
-    ``float16`` halves the file and rounds every weight to 11 bits; :func:`load_model` computes in float32 all the same.
+    ``float16`` halves the file and rounds every weight to 11 bits; :func:`load_checkpoint` computes in float32 all the same.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def find_model(path: str | Path | None) -> Path:
     return Path(path) / "model.safetensors" if Path(path).is_dir() else Path(path)
 
 
-def load_model(path: str | Path | None = None) -> tuple[Model, Config, dict[str, Any]]:
+def load_checkpoint(path: str | Path | None = None) -> tuple[Model, Config, dict[str, Any]]:
     """Load a file, a run's folder or, with ``None`` or ``bundled``, the bundled weights; strictly, and to compute in float32.
 
     Returns

@@ -13,7 +13,7 @@ from tofcapture.files.manifest import Manifest, load_manifest, manifest_path
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Config
 from tofcapture_model.networks import Model
-from tofcapture_model.networks.checkpoint import find_model, load_model, origin, sentence
+from tofcapture_model.networks.checkpoint import find_model, load_checkpoint, origin, sentence
 from tofcapture_model.training import read_metrics
 
 
@@ -112,7 +112,7 @@ def _read_network(weights: Path | None) -> tuple[Network | None, str]:
     if not path.is_file():
         return None, f"there is no checkpoint at {path}"
     rows = read_metrics(path.parent / "metrics.jsonl")
-    return Network(*load_model(path), path.name, sha256_of(path), rows, weights is None), ""
+    return Network(*load_checkpoint(path), path.name, sha256_of(path), rows, weights is None), ""
 
 
 def doubts(sources: Sources) -> list[str]:

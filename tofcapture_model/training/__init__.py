@@ -36,7 +36,7 @@ from tofcapture_model.networks import Model
 from tofcapture_model.networks.checkpoint import (
     find_model,
     learned_from,
-    load_model,
+    load_checkpoint,
     load_strictly,
     read_tensors,
     write_tensors,
@@ -388,7 +388,7 @@ def source_of(model: Model, config: Config, datasets: Sequence[Path], start: Pat
     source: dict[str, Any] = {"dataset": str(first), "manifest_sha256": _digest(first)}
     known: dict[str, Any] | None = None
     if start:
-        other, its, known = load_model(start)
+        other, its, known = load_checkpoint(start)
         if its.network != config.network:
             raise ConfigError(
                 f"{start}: expected weights of the configuration's network ({config.network.kind}), got {its.network.kind} with other sizes or kind",

@@ -15,14 +15,14 @@ from torch import nn
 
 from tofcapture.cli.kit import Report
 from tofcapture.files.manifest import load_manifest
-from tofcapture_model.config import Config, Stage
+from tofcapture_model.config import Config, Stage, preset
 from tofcapture_model.data import FrameDataset, spare_memory
 from tofcapture_model.data.augment import BurstNoise, redraw_calibration, redraw_frame
 from tofcapture_model.evaluation.evaluate import calibrate
 from tofcapture_model.frame import Estimate, Frame
 from tofcapture_model.losses import Objective
 from tofcapture_model.networks import Model, build_model, compile_unets, select_stage, training_loss
-from tofcapture_model.networks.checkpoint import save_model
+from tofcapture_model.networks.checkpoint import find_model, save_model
 from tofcapture_model.networks.joint import JointModel
 from tofcapture_model.training import (
     Group,
@@ -42,7 +42,7 @@ MAX_NORM = 1.0  # of the gradient
 
 
 def train(
-    config: Config,
+    config: Config | str,
     dataset: str | Path,
     out: str | Path,
     *,
@@ -51,9 +51,9 @@ def train(
     stop_after: int | None = None,
     device: str = "cpu",
     workers: int = 0,
-    cache: Path | None = None,
-    start: Path | None = None,
-    also: Sequence[Path] = (),
+    cache: str | Path | None = None,
+    start: str | Path | None = None,
+    also: Sequence[str | Path] = (),
     report: Report = lambda _what, _done, _total, _text="": None,
 ) -> Trained:
     """Train all stages of a configuration on the ``train`` split of a dataset.
@@ -63,7 +63,7 @@ def train(
     Parameters
     ----------
     config
-        Network, losses, stages.
+        Network, losses, stages; or the name of a preset.
     dataset, also
         Folders with ``manifest.json``: the first, which also validates, and further ones to learn from.
     out
@@ -81,7 +81,7 @@ def train(
     cache
         Folder that ``tofcapture pack`` filled with the ``train`` split; ``None`` reads the shards.
     start
-        Checkpoint to start from instead of random weights (fine-tuning); its network must be the configuration's.
+        Checkpoint, or ``bundled``, to start from instead of random weights (fine-tuning); its network must be the configuration's.
     report
         Called with the stage, what is done of it, all of it, and one line of text.
 
@@ -94,6 +94,7 @@ def train(
     DataError
         A split is empty, or a loss is not finite: no step is taken then.
     """
+    config = preset(config) if isinstance(config, str) else config
     if epochs is not None:
         config = replace(config, stages=tuple(replace(s, epochs=epochs) for s in config.stages))
     datasets = [Path(dataset), *map(Path, also)]
@@ -103,7 +104,7 @@ def train(
     with processes(device) as group, held(out, group):
         torch.manual_seed(config.training.seed)
         model = build_model(config).to(group.device)
-        source = source_of(model, config, datasets, start)
+        source = source_of(model, config, datasets, None if start is None else find_model(start))
         run = Run(config, model, group, datasets[0], out, source, minutes, report)
         if run.position.stage == len(config.stages):
             return run.ended()
@@ -112,7 +113,7 @@ def train(
         training = config.training
         data = FrameDataset(
             datasets, "train", training.crop, flip=training.flip, seed=training.seed, frames=training.frames,
-            mean=training.noise == "drawn", cache_bytes=0 if workers else spare_memory(), cache=cache,
+            mean=training.noise == "drawn", cache_bytes=0 if workers else spare_memory(), cache=None if cache is None else Path(cache),
         )  # fmt: skip
         with closing(data), run:
             for stage in config.stages[run.position.stage :]:

@@ -283,11 +283,12 @@ def shared_world(context: StationContext) -> SimWorld:
     return found
 
 
-def simulate(path: Path, *, ideal: bool, frames: int) -> View:
+def simulate(path: str | Path, *, ideal: bool = False, frames: int = 10) -> View:
     """Render one view of a world file.
 
     ``ideal`` switches every sensor imperfection and quantisation off; raw is float64 then. ``frames`` are those of the burst.
     """
+    path = Path(path)
     file = load_world(path)
     constants = file.constants.idealised() if ideal else file.constants
     world = SimWorld(constants, file.seed, lambda _name, _seed: file.objects)

@@ -13,7 +13,7 @@ from tofcapture.devices.kinematics import ArmModel
 from tofcapture.errors import DataError
 from tofcapture.files.hdf import fetch, open_checked
 from tofcapture.files.layout import BOARD_SCENE, VIEW
-from tofcapture.files.view import read_view
+from tofcapture.files.view import open_view
 from tofcapture.poses import Float64, transform_points
 from tofcapture.rig import Rig
 from tofcapture.viz.page import STEREO, TOF, draw_rig, frustum
@@ -53,7 +53,7 @@ def draw_acquisition(figure: Any, path: Path, scene: str | None, view: int | Non
     rig, arm = rig_of(path, chosen), arm_of(path)
     board = scenes_of(path).get(BOARD_SCENE, [])[:1]
     shown = [chosen, *(board if chosen.parent.name != BOARD_SCENE else [])]
-    shots = [view_shot(read_view(p), rig) for p in shown]
+    shots = [view_shot(open_view(p), rig) for p in shown]
     words = f"{chosen.parent.name}: {len(paths)} arm poses; view {number_of(chosen)} in black"
     figure.set_size_inches(WIDTH, _HEIGHT)
     figure.text(0.05 / WIDTH, 1 - 0.05 / _HEIGHT, f"Acquisition of {words}", fontsize=FONT, va="top")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tofcapture.colours import GROUND_TRUTH, REMOVED, SENSOR
 from tofcapture.dataset.sample import SampleConfig, check_cameras, decoder_for, find_object
 from tofcapture.errors import DataError
-from tofcapture.files.view import read_view
+from tofcapture.files.view import open_view
 from tofcapture.frames import View
 from tofcapture.ops.crop import crop_depth
 from tofcapture.ops.denoise import denoise
@@ -61,7 +61,7 @@ def draw_preprocessing(figure: Any, path: Path, scene: str | None, view: int | N
             f"{chosen}: no calibrated rig: {used} does not exist",
             hint="tofcapture align RECORDING, or --rig rig.toml",
         )
-    found, constants = read_view(chosen), load_rig(used)
+    found, constants = open_view(chosen), load_rig(used)
     steps = preprocess(found, constants)
     T = found.arm_before.T_base_flange @ constants.T_flange_tof
     name = f"{found.scene} {found.index}"
