@@ -131,7 +131,9 @@ class ArmInfo:
 class ArmState:
     """Tell where the arm says it is."""
 
-    joints: Float64  #: (6,) measured joint angles, radians.
+    joints: (
+        Float64  #: (6,) measured joint angles, radians; NaN: there is no arm, somebody else says the pose.
+    )
     T_base_flange: Float64  #: (4, 4), from the measured joints.
     time_ns: int  #: int, monotonic clock.
 
@@ -172,3 +174,8 @@ class View:
         frames, *sizes = self.tof.raw.shape
         shapes = " x ".join(map(str, sizes)), " x ".join(map(str, self.stereo.points.shape[:2]))
         return f"View({self.scene} {self.index}: {frames} frames of {shapes[0]}, stereo {shapes[1]})"
+
+    @property
+    def has_arm(self) -> bool:
+        """Whether an arm says where the view was taken, so that the base's z is up."""
+        return bool(np.isfinite(self.arm_before.joints).all())

@@ -32,7 +32,7 @@ EXIT_CODES = "exit codes: 0 ok, 1 unexpected, 2 usage, 3 config, 4 device, 5 dat
 DESCRIPTION = "Capture paired ToF raw data and stereo ground truth on a robot arm, build datasets, train networks on them."
 GROUPS = {
     "begin": ("demo", "doctor", "config", "completion"),
-    "record": ("record", "daemon", "status", "stop", "simulate", "simulate-dataset"),
+    "record": ("record", "daemon", "status", "stop", "import", "simulate", "simulate-dataset"),
     "calibrate": ("align", "calibrate"),
     "datasets": ("build-dataset", "check", "stats", "view", "figure", "pack", "export-dataset"),
     "network": ("train", "evaluate", "predict", "export", "report"),

@@ -15,7 +15,7 @@ from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardReader, TofMaps
 from tofcapture.frames import TofInfo, View
-from tofcapture.ops.crop import Crop, crop_depth, find_crop, refine_clearance
+from tofcapture.ops.crop import WHOLE, Crop, crop_depth, find_crop, refine_clearance
 from tofcapture.ops.denoise import denoise
 from tofcapture.ops.normals import PlaneField, grazing
 from tofcapture.ops.phase import Decoder
@@ -101,7 +101,9 @@ def make_sample(
     measured = np.ascontiguousarray(view.stereo.points[..., 2] if depth is None else depth)
     native = np.where(denoise(measured, rig.stereo), measured, np.float32(np.nan))
     # Align it with the ToF camera, and crop what stands on the table.
-    crop = find_object(native, rig, T_base_tof, config, rng)
+    # Without an arm nobody knows which way is up: all of it is the object.
+    crop_config = config if view.has_arm else replace(config, crop_radius=WHOLE)
+    crop = find_object(native, rig, T_base_tof, crop_config, rng)
     # Project the surface on the ToF plane, with normals and mask.
     sheet = triangulate(native, rig.stereo)
     planes = PlaneField(np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)

@@ -129,7 +129,7 @@ stereo_info | JSON | model, serial, intrinsics of the point map's grid
 provenance  | JSON | versions, digests of inputs, seeds, UTC time
 """
 _ARM = """\
-arm/{0}/joints        | float64 | 6   | - | rad | measured joint angles {0} the exposures
+arm/{0}/joints        | float64 | 6   | - | rad | measured joint angles {0} the exposures; NaN: no arm
 arm/{0}/T_base_flange | float64 | 4 4 | - | m   | flange to base, {0} the exposures
 arm/{0}/time_ns       | int64   |     | - | ns  | monotonic clock
 """

@@ -1,0 +1,133 @@
+"""Read arrays of NumPy (.npy, .npz), MATLAB (.mat) and HDF5 (.h5)."""
+
+from __future__ import annotations
+
+import warnings
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.errors import ConfigError, DataError, FormatError
+from tofcapture.importing.said import Said
+from tofcapture.importing.source import Facts, Piece
+
+SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".hdf")
+CHANNELS = ("modulation_hz", "phase_rad", "offset", "saturation")  # what may lie beside an array
+
+
+def claims(path: Path) -> bool:
+    """Tell by the suffix."""
+    return path.is_file() and path.suffix.lower() in SUFFIXES
+
+
+def pieces(path: Path, said: Said) -> Iterator[Piece]:
+    """List the arrays of two axes and more; channels that lie beside them are facts."""
+    del said
+    held = arrays_of(path)
+    facts = facts_of(held, path)
+    for name, array in held.items():
+        if name not in CHANNELS and array.ndim >= 2 and max(array.shape) > 4:
+            yield Piece(name if len(held) > 1 else "", path, partial(load_array, path, name), facts=facts)
+
+
+def facts_of(held: Mapping[str, NDArray[Any]], path: Path) -> Facts:
+    """Read the channels that lie beside an array."""
+    said = {k: np.asarray(held[k]).reshape(-1) for k in CHANNELS if k in held}
+    try:
+        return Facts(
+            modulation_hz=tuple(map(float, said.get("modulation_hz", ()))),
+            phase_rad=tuple(map(float, said.get("phase_rad", ()))),
+            saturation=float(said["saturation"][0]) if "saturation" in said else None,
+            offset=bool(said["offset"][0]) if "offset" in said else None,
+        )
+    except (TypeError, ValueError, IndexError) as err:
+        hint = "np.savez(path, raw=raw, modulation_hz=hz, phase_rad=phases), one number a channel"
+        raise DataError(
+            f"{path}: the channels that lie beside the array are no numbers: {err}", hint
+        ) from err
+
+
+def load_array(path: Path, name: str) -> NDArray[Any]:
+    """Read one array of a file by its name."""
+    array = arrays_of(path)[name]
+    if array.dtype.kind not in "iufb":
+        raise DataError(f"{path}: {name or 'array'}: expected numbers, got {array.dtype}")
+    return np.ascontiguousarray(array.astype(array.dtype.newbyteorder("="), copy=False))
+
+
+def arrays_of(path: Path) -> dict[str, NDArray[Any]]:
+    """Read every array of a file by name; a ``.npy`` has one without a name.
+
+    Arrays of MATLAB have the axes that MATLAB shows, in both of its formats. Raises :class:`FormatError` for a file that is
+    damaged or of another kind.
+    """
+    suffix = path.suffix.lower()
+    try:
+        if suffix in {".npy", ".npz"}:
+            return _numpy(path)
+        with path.open("rb") as file:
+            head = file.read(16)
+        if suffix == ".mat" and not head.startswith((b"\x89HDF", b"MATLAB 7.3")):
+            return _matlab(path)
+        return _hdf5(path, turned=suffix == ".mat")
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError) as err:
+        raise FormatError(
+            f"{path}: cannot read the array: {err}",
+            hint="copy the file again, or write it with np.save"
+            if suffix.startswith(".n")
+            else "copy it again",
+        ) from err
+
+
+def _numpy(path: Path) -> dict[str, NDArray[Any]]:
+    mapped = "r" if path.suffix.lower() == ".npy" else None
+    found = np.load(path, allow_pickle=False, mmap_mode=mapped)
+    if isinstance(found, np.ndarray):
+        return {"": found}
+    with found:
+        return {name: np.asarray(found[name]) for name in found.files}
+
+
+def _matlab(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        from scipy.io import loadmat
+        from scipy.io.matlab import MatReadError
+    except ImportError as err:
+        raise ConfigError(
+            f"{path}: reading MATLAB files needs scipy: {err}", hint="pip install 'tofcapture[capture]'"
+        ) from err
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = loadmat(path)
+    except (MatReadError, NotImplementedError, TypeError) as err:
+        raise ValueError(err) from err
+    arrays = {k: v for k, v in found.items() if not k.startswith("__")}
+    return {k: v for k, v in arrays.items() if isinstance(v, np.ndarray) and v.dtype.kind in "iufb"}
+
+
+def _hdf5(path: Path, *, turned: bool) -> dict[str, NDArray[Any]]:
+    """Read all datasets; MATLAB writes the axes of its arrays in reverse."""
+    import h5py
+
+    held: dict[str, NDArray[Any]] = {}
+
+    def keep(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and item.dtype.kind in "iufb" and not name.startswith("#refs#"):
+            held[name] = np.asarray(item[()])
+
+    with h5py.File(path, "r") as file:
+        kind = file.attrs.get("format")
+        if isinstance(kind, str) and kind.startswith("tofcapture-"):
+            raise FormatError(
+                f"{path}: is a {kind.removeprefix('tofcapture-')} of tofcapture already",
+                hint="tofcapture check names what it holds; build-dataset and predict take it as it is",
+            )
+        file.visititems(keep)
+    return {k: v.T for k, v in held.items()} if turned else held

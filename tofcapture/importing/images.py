@@ -1,0 +1,91 @@
+"""Read 16-bit images (.png, .tif, .pgm) and files of plain words (.raw, .bin) whose size is said."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.errors import ConfigError, FormatError
+from tofcapture.importing.rules import roughness
+from tofcapture.importing.said import Said
+from tofcapture.importing.source import Piece
+
+IMAGES = (".png", ".tif", ".tiff", ".pgm", ".bmp")
+BINARY = (".raw", ".bin")
+
+
+def claims(path: Path) -> bool:
+    """Tell by the suffix."""
+    return path.is_file() and path.suffix.lower() in (*IMAGES, *BINARY)
+
+
+def pieces(path: Path, said: Said) -> Iterator[Piece]:
+    """List the one image, or the words, of a file."""
+    if path.suffix.lower() in IMAGES:
+        yield Piece("", path, partial(read_image, path))
+        return
+    shape, dtype = said.tuple_of("raw", "shape"), str(said.raw.get("dtype", ""))
+    yield Piece("", path, partial(read_words, path, tuple(map(int, shape)), dtype))
+
+
+def read_image(path: Path) -> NDArray[Any]:
+    """Read one grey image (H, W), or the pages of a TIFF (N, H, W).
+
+    Raises :class:`FormatError` for anything else, :class:`ConfigError` without OpenCV.
+    """
+    try:
+        import cv2
+    except ImportError as err:
+        raise ConfigError(
+            f"{path}: reading images needs OpenCV",
+            hint="pip install opencv-python-headless, or convert to .npy",
+        ) from err
+    if path.suffix.lower() in {".tif", ".tiff"}:
+        pages = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)[1]
+    else:
+        pages = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED)]
+    if not pages or pages[0] is None:
+        raise FormatError(f"{path}: expected an image", hint="copy it again")
+    if any(p.ndim == 3 and (p[..., :1] != p[..., :3]).any() for p in pages):
+        raise FormatError(
+            f"{path}: expected one channel of grey, got colours",
+            hint="a coloured picture of a depth is no measurement; export 16-bit grey, or name other files in import.toml",
+        )
+    grey = [np.asarray(p[..., 0] if p.ndim == 3 else p) for p in pages]
+    return grey[0] if len(grey) == 1 else np.stack(grey)
+
+
+def read_words(path: Path, shape: tuple[int, ...], dtype: str = "") -> NDArray[Any]:
+    """Read words (n, H, W) of a file that does not say its size.
+
+    ``shape`` ends with H and W; a longer one is that of the array. ``dtype`` is NumPy's, such as ``>u2``; without one words have
+    16 bits, and their byte order is the one in which neighbours are alike. Raises :class:`FormatError`: sizes that do not fit.
+    """
+    if len(shape) < 2 or min(shape, default=0) < 1:
+        raise FormatError(
+            f"{path}: a binary file does not say its size",
+            hint="--shape H,W, or [raw] shape = [H, W] in import.toml",
+        )
+    try:
+        kind = np.dtype(dtype or "<u2")
+    except TypeError as err:
+        raise ConfigError(
+            f"{path}: dtype: expected one of NumPy such as '<u2' or '>i2', got {dtype!r}"
+        ) from err
+    data, (rows, columns) = path.read_bytes(), shape[-2:]
+    if not data or len(data) % (rows * columns * kind.itemsize):
+        size = len(data) / kind.itemsize
+        raise FormatError(
+            f"{path}: expected a multiple of {rows} x {columns} {8 * kind.itemsize}-bit words, got {size:g}",
+            hint=f"rows of metadata count: {size / columns:g} rows of {columns} in all",
+        )
+    images = np.frombuffer(data, dtype=kind).reshape(-1, rows, columns)
+    if not dtype:
+        images = min((images, images.byteswap()), key=roughness)
+    out = images.astype(kind.newbyteorder("="))
+    return out.reshape(shape) if len(shape) > 2 and out.size == np.prod(shape) else out

@@ -1,0 +1,345 @@
+"""Decide from names and shapes what the arrays of a source are: scenes, views, frames and channels, and their ground truth."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.errors import ConfigError, DataError
+from tofcapture.files.view import check_scene_name
+from tofcapture.importing.rules import in_order
+from tofcapture.importing.said import Said
+from tofcapture.importing.source import Facts, Piece, find_pieces, natural
+
+TRUTH = frozenset(
+    [
+        "depth",
+        "depths",
+        "gt",
+        "truth",
+        "ground",
+        "groundtruth",
+        "points",
+        "cloud",
+        "clouds",
+        "xyz",
+        "target",
+        "mesh",
+        "pointcloud",
+        "z",
+        "radial",
+        "range",
+    ]
+)
+RAW = frozenset(
+    ["raw", "tof", "taps", "tap", "dcs", "phases", "phase", "frames", "correlation", "correlations", "iq"]
+)
+OTHER = frozenset(
+    [
+        "amplitude",
+        "confidence",
+        "flags",
+        "mask",
+        "ir",
+        "intensity",
+        "rgb",
+        "color",
+        "colour",
+        "image",
+        "ambient",
+        "normals",
+        "times",
+        "time",
+        "stamps",
+    ]
+)
+CHANNEL = frozenset(
+    ["c", "ch", "chan", "channel", "k", "tap", "taps", "phase", "p", "deg", "mhz", "hz", "dcs", "i"]
+)
+FRAME = frozenset(["f", "fr", "frame", "frames", "burst"])
+AXIS = (
+    TRUTH
+    | RAW
+    | CHANNEL
+    | FRAME
+    | frozenset(
+        ["v", "view", "views", "pose", "poses", "shot", "img", "image", "n", "no", "npy", "data", "array"]
+    )
+)
+MOST_NAMED = 5
+Array = NDArray[Any]
+Key = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Planned:
+    """One view, as a source has it."""
+
+    scene: str
+    index: int
+    raw: Callable[[], Array]  #: Reads (F, K, H, W).
+    facts: Facts  #: What the files know of the raw arrays.
+    truth: Callable[[], Array] | None  #: Reads the ground truth, in the source's own unit and shape.
+    truth_facts: Facts
+    pieces: tuple[Piece, ...]  #: Everything it is made of.
+    time_ns: tuple[int, ...] = ()  #: Stamps of the frames, if the source has them.
+    T_world_tof: Any = None  #: (4, 4) pose of the camera, if the source has it.
+
+
+@dataclass(frozen=True)
+class _Named:
+    """What a piece's name says."""
+
+    piece: Piece
+    role: str
+    words: tuple[str, ...]  # that are no role and no axis: a scene's name
+    folders: int  # of these words, those of folders
+    numbers: tuple[tuple[str, int], ...]  # (word before, number)
+
+
+def plan(source: Path, said: Said) -> list[Planned]:
+    """Plan the views of a source.
+
+    Raises :class:`DataError`: nothing raw is there, sizes that do not fit, ground truth that is missing for some views; the
+    message says what to write into ``import.toml``.
+    """
+    named = [_named(p, said) for p in find_pieces(source, said)]
+    if not any(n.role == "raw" for n in named):
+        # Names that say nothing are raw, unless others say that they are.
+        named = [replace(n, role="raw") if n.role == "" else n for n in named]
+    raw = _scenes([n for n in named if n.role == "raw"], said, source)
+    if not raw:
+        raise DataError(
+            f"{source}: expected raw arrays, found only {_some([n.piece.name for n in named])}",
+            hint='say which are raw: [raw] files = "..." in import.toml, or call them raw-000.npy ...',
+        )
+    truth = _scenes([n for n in named if n.role == "truth"], said, source)
+    if said.truth.get("kind") == "none":
+        truth = {}
+    if len(raw) == 1 and len(truth) == 1:
+        truth = dict(zip(raw, truth.values(), strict=True))
+    _expect_same_scenes(raw, truth, source)
+    out = list[Planned]()
+    for scene, found in raw.items():
+        facts = found[0].piece.facts
+        channels, size = len(said.channels(facts)[0]), said.size(facts)
+        views = _views(found, truth.get(scene, []), said, channels, size, source)
+        out += [replace(v, scene=check_scene_name(scene), index=i) for i, v in enumerate(views)]
+    return out
+
+
+def _named(piece: Piece, said: Said) -> _Named:
+    place, _, array = piece.name.partition(":")
+    parts = [*Path(place).with_suffix("").parts, *([array] if array else [])]
+    words, numbers, roles, folders = list[str](), list[tuple[str, int]](), set[str](), 0
+    for depth, part in enumerate(parts):
+        last = ""
+        for word, digits in re.findall(r"([A-Za-z]+)|(\d+)", part):
+            if digits:
+                numbers.append((last.lower(), int(digits)))
+                continue
+            last, low = word, word.lower()
+            roles |= {r for r, known in (("truth", TRUTH), ("raw", RAW), ("other", OTHER)) if low in known}
+            if low not in AXIS:
+                words.append(word)
+                folders += depth < len(parts) - 1
+    role = piece.role or next((r for r in ("truth", "raw", "other") if r in roles), "")
+    for table, name in ((said.truth, "truth"), (said.raw, "raw")):
+        if pattern := table.get("files"):
+            matches = fnmatch(piece.name, str(pattern)) or fnmatch(Path(place).name, str(pattern))
+            role = name if matches else ("" if role == name else role)
+    return _Named(piece, role, tuple(words), folders, tuple(numbers))
+
+
+def _scenes(named: Sequence[_Named], said: Said, source: Path) -> dict[str, list[_Named]]:
+    """Sort pieces into scenes: by the words of their names that not all have in common."""
+    if not named:
+        return {}
+    own = said.scene or re.sub(r"[^A-Za-z0-9_.-]+", "-", source.resolve().stem).strip("-.") or "scene"
+    if said.scene:
+        return {own: list(named)}
+    common = set.intersection(*(set(n.words) for n in named))
+    shared = [w for w in named[0].words[: named[0].folders] if w in common]
+    out: dict[str, list[_Named]] = {}
+    for n in named:
+        label = "-".join(w for w in n.words if w not in common or (len(named) == 1 and n.folders))
+        out.setdefault(label or (shared[0] if shared else own), []).append(n)
+    return out
+
+
+def _expect_same_scenes(raw: Mapping[str, Any], truth: Mapping[str, Any], source: Path) -> None:
+    alone = [s for s in raw if s not in truth] if truth else []
+    alone += [s for s in truth if s not in raw]
+    if alone:
+        raise DataError(
+            f"{source}: expected raw arrays and ground truth for every scene, got only one of them for {_some(alone)}",
+            hint='give pairs the same name: mug.npy and mug_depth.npy; or [truth] kind = "none" in import.toml',
+        )
+
+
+def _views(
+    raw: list[_Named], truth: list[_Named], said: Said, K: int, size: tuple[int, int] | None, source: Path
+) -> list[Planned]:
+    """Group the pieces of a scene into views, and pair them with their ground truth."""
+    groups = _grouped(raw, said, K)
+    axes = str(said.raw.get("axes", "")) or raw[0].piece.facts.axes
+
+    def read(pieces: list[Piece]) -> Array:
+        """Read (N, F, K, H, W)."""
+        arrays = [p.load() for p in pieces]
+        sizes = {a.shape for a in arrays}
+        if len(sizes) > 1:
+            raise DataError(
+                f"{pieces[0].path}: expected arrays of one size, got {_some(map(str, sorted(sizes)))}",
+                hint='leave out what does not belong: [raw] files = "..." in import.toml',
+            )
+        where, array = str(pieces[0].path), arrays[0] if len(arrays) == 1 else np.stack(arrays)
+        if len(arrays) == 1 or arrays[0].ndim == 2:
+            return in_order(array, K, size, axes, where)
+        frames = [in_order(a, K, size, axes, where)[0] for a in arrays]
+        return np.concatenate(frames)[None]
+
+    if len(groups) == 1:
+        return _of_one(next(iter(groups.values())), truth, read, source)
+    targets = _paired(groups, truth, source)
+    out = []
+    for (_, pieces), target in zip(groups.items(), targets, strict=True):
+        out.append(_planned(pieces, lambda pieces=pieces: read(pieces)[0], target, None))
+    return out
+
+
+def _of_one(
+    pieces: list[Piece], truth: list[_Named], read: Callable[[list[Piece]], Array], source: Path
+) -> list[Planned]:
+    """Take one group apart: it is a burst, or has all views of a scene in it."""
+    array = read(pieces)
+    count, targets = len(array), [t.piece for t in truth]
+    if len(targets) == 1:
+        n = _leading(targets[0].load())
+        if count == 1 and n == array.shape[1] > 1:  # a truth for every frame: these are views
+            array = array[0][:, None]
+            count = n
+        if n not in (count, 1) or (n == 1 and count > 1):
+            raise DataError(
+                f"{source}: expected ground truth for {count} views, got {n} of {targets[0].name}",
+                hint='one depth a view; [raw] axes = "NFKHW" says what the axes of the raw array are',
+            )
+        single = targets[0]
+        loads = [lambda i=i: single.load()[i] if n > 1 else single.load() for i in range(count)]
+        return [replace(_planned(pieces, lambda i=i: array[i], single, loads[i])) for i in range(count)]
+    if count == 1 and len(targets) == array.shape[1] > 1:
+        array, count = array[0][:, None], array.shape[1]
+    if len(targets) not in (0, count):
+        raise DataError(
+            f"{source}: expected ground truth for {count} views, got {len(targets)} files",
+            hint="one depth a view, numbered as the raw arrays",
+        )
+    return [
+        _planned(pieces, lambda i=i: array[i], targets[i] if targets else None, None) for i in range(count)
+    ]
+
+
+def _leading(array: Array) -> int:
+    """Count the views of a ground truth: (N, H, W) or (N, H, W, 3) have several."""
+    several = array.ndim == 4 or (array.ndim == 3 and array.shape[-1] != 3 and array.shape[0] != 3)
+    return len(array) if several else 1
+
+
+def _planned(
+    pieces: list[Piece], raw: Callable[[], Array], target: Piece | None, truth: Callable[[], Array] | None
+) -> Planned:
+    facts = Facts()
+    for piece in pieces:
+        facts = facts.over(piece.facts)
+    stamps = tuple(p.time_ns for p in pieces if p.time_ns is not None)
+    return Planned(
+        "", 0, raw, facts,
+        truth or (target.load if target else None),
+        target.facts if target else Facts(),
+        (*pieces, *([target] if target else [])),
+        stamps if len(stamps) == len(pieces) else (),
+    )  # fmt: skip
+
+
+def _grouped(raw: list[_Named], said: Said, K: int) -> dict[Key, list[Piece]]:
+    """Group raw pieces into views by the numbers in their names; the pieces of a group are in order: frames, then channels."""
+    raw = sorted(raw, key=lambda n: natural(n.piece.name))
+    first = raw[0].piece.load()
+    per_piece = first.ndim == 2 and not said.raw.get("axes")  # one channel a file
+    if len({len(n.numbers) for n in raw}) > 1 or len(raw) == 1:
+        return _in_turn(raw, K if per_piece else 1)
+    columns = [[n.numbers[i] for n in raw] for i in range(len(raw[0].numbers))]
+    varying = [i for i, column in enumerate(columns) if len({v for _, v in column}) > 1]
+    many = {i: len({v for _, v in columns[i]}) for i in varying}
+    if prod(many.values()) != len(raw):
+        return _in_turn(raw, K if per_piece else 1)
+    inner = _channel_columns(varying, many, columns, K) if per_piece else []
+    if per_piece and not inner:
+        return _in_turn(raw, K)
+    rest = [i for i in varying if i not in inner]
+    frames = [i for i in rest if columns[i][0][0] in FRAME]
+    frames = frames if len(frames) < len(rest) else []
+    out: dict[Key, list[tuple[Key, Piece]]] = {}
+    for n in raw:
+        values = [v for _, v in n.numbers]
+        key = tuple(values[i] for i in rest if i not in frames)
+        out.setdefault(key, []).append((tuple(values[i] for i in (*frames, *inner)), n.piece))
+    return {k: [p for _, p in sorted(found, key=lambda f: f[0])] for k, found in sorted(out.items())}
+
+
+def _channel_columns(
+    varying: list[int], many: Mapping[int, int], columns: list[list[tuple[str, int]]], K: int
+) -> list[int]:
+    """Find the numbers of a name that count the channels: by the word before them, or by how many there are."""
+    called = [i for i in varying if columns[i][0][0] in CHANNEL]
+    options = [called, *(varying[-n:] for n in (1, 2)), *(varying[:n] for n in (1, 2))]
+    return next((o for o in options if o and prod(many[i] for i in o) == K), [])
+
+
+def _in_turn(raw: list[_Named], each: int) -> dict[Key, list[Piece]]:
+    if len(raw) % each:
+        raise DataError(
+            f"{raw[0].piece.path.parent}: expected a multiple of {each} images, one a channel, got {len(raw)}",
+            hint="is a file missing, or are there other channels? [tof] modulation_mhz and phase_deg in import.toml say which",
+        )
+    return {(i,): [n.piece for n in raw[i * each : (i + 1) * each]] for i in range(len(raw) // each)}
+
+
+def _paired(groups: Mapping[Key, Any], truth: list[_Named], source: Path) -> list[Piece | None]:
+    """Find the ground truth of every view: by number, by stamp, else by order."""
+    if not truth:
+        return [None] * len(groups)
+    truth = sorted(truth, key=lambda n: natural(n.piece.name))
+    keys = {tuple(v for _, v in n.numbers): n.piece for n in truth}
+    short = {key[-1:]: piece for key, piece in keys.items()}
+    for known in (keys, short):
+        if len(known) == len(truth) and set(groups) <= set(known):
+            return [known[k] for k in groups]
+    if len(truth) == len(groups):
+        return [n.piece for n in truth]
+    missing = [".".join(map(str, k)) for k in groups if k not in short and k not in keys]
+    raise DataError(
+        f"{source}: expected ground truth for each of {len(groups)} views, got {len(truth)}"
+        + (f"; there is none for {_some(missing)}" if missing else ""),
+        hint='copy the missing files, or import without ground truth: [truth] kind = "none" in import.toml',
+    )
+
+
+def _some(names: Any) -> str:
+    names = list(names)
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return ", ".join(names[:MOST_NAMED]) + more
+
+
+def require(found: Mapping[str, object], where: str, hint: str) -> None:
+    """Name everything that is missing, at once: the keys whose value is ``None`` or empty."""
+    if missing := [key for key, value in found.items() if value is None or value == ()]:
+        raise ConfigError(f"{where}: missing {', '.join(missing)}", hint=hint)

@@ -1,0 +1,95 @@
+"""Define what a reader is, and find the arrays of a source with all of them.
+
+A reader is a module with two functions, and stands in :data:`READERS`::
+
+    def claims(path: Path) -> bool: ...                          # does it read this file, or this folder as a whole?
+    def pieces(path: Path, said: Said) -> Iterator[Piece]: ...   # what is in it, read only when it is asked for
+
+Readers say what lies where and what the file knows of it. What it means is decided once, for all readers, in
+:mod:`tofcapture.importing.plan`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal, Protocol, cast
+
+from numpy.typing import NDArray
+
+from tofcapture.errors import DataError
+from tofcapture.importing.said import Facts, Said
+from tofcapture.poses import Float64
+
+Role = Literal["", "raw", "truth", "pose", "other"]
+READERS = ("vendors", "arrays", "images")
+"""Modules of this package, asked in this order; the first that claims a path reads it."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Hold one array of a source."""
+
+    name: str  #: Place below the source: ``mug/raw-003.npz:raw``, ``bag.mcap:/tof/image``; patterns are matched with it.
+    path: Path  #: The file that it is in.
+    load: Callable[[], NDArray[Any]]  #: Reads it; raises :class:`DataError` with the file's name.
+    role: Role = ""  #: What it is, where the reader knows; else its name tells.
+    time_ns: int | None = None  #: Its stamp.
+    facts: Facts = field(default_factory=Facts)  #: What the file knows of it.
+    #: (4, 4) pose of the camera in the world, of a ``pose``; (4, 4) to the ToF camera, of a ``truth``.
+    T: Float64 | None = None
+
+
+class Reader(Protocol):
+    """Read one kind of file, or of folder."""
+
+    def claims(self, path: Path) -> bool:
+        """Tell whether this path is of its kind, by its name or its first bytes."""
+
+    def pieces(self, path: Path, said: Said) -> Iterator[Piece]:
+        """List the arrays in it; names are relative to ``path``, empty for a file's only array."""
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Order names with numbers in them by the numbers."""
+    return [(int(t), "") if t.isdecimal() else (-1, t) for t in re.split(r"(\d+)", name)]
+
+
+def find_pieces(source: Path, said: Said) -> list[Piece]:
+    """List the arrays of a file or a folder, in the natural order of their names.
+
+    Raises :class:`DataError`: it does not exist, or holds nothing that a reader reads.
+    """
+    if not source.exists():
+        raise DataError(f"{source}: no such file or folder")
+    readers = [cast("Reader", import_module(f"tofcapture.importing.{name}")) for name in READERS]
+    found, passed = list[Piece](), list[str]()
+    for path in _paths(source, readers):
+        reader = next((r for r in readers if r.claims(path)), None)
+        if reader is None:
+            passed.append(path.name)
+            continue
+        place = path.name if path == source else str(path.relative_to(source))
+        found += [
+            replace(p, name=f"{place}:{p.name}" if p.name else place) for p in reader.pieces(path, said)
+        ]
+    if not found:
+        kinds = "arrays (.npy, .npz, .mat, .h5), 16-bit images (.png, .tif), raw words (.raw, .bin) or bags"
+        raise DataError(
+            f"{source}: expected {kinds}, found {', '.join(sorted(passed)[:5]) or 'an empty folder'}",
+            hint="save the arrays with np.save; see docs/howto/own-data.md",
+        )
+    return sorted(found, key=lambda p: natural(p.name))
+
+
+def _paths(source: Path, readers: list[Reader]) -> Iterator[Path]:
+    """Walk a source; a folder that a reader claims as a whole is not looked into."""
+    if source.is_file() or any(r.claims(source) for r in readers):
+        yield source
+        return
+    for path in sorted(source.iterdir(), key=lambda p: natural(p.name)):
+        if not path.name.startswith(".") and path.name != "import.toml":
+            yield from _paths(path, readers)

@@ -1,0 +1,166 @@
+"""Bring ground truth of any form into an organised point map of a camera that sees along z."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.camera import Camera, distorted
+from tofcapture.errors import ConfigError, DataError
+from tofcapture.importing.plan import Planned
+from tofcapture.importing.rules import Float32, metres
+from tofcapture.importing.said import Said
+from tofcapture.poses import Float64
+
+NONE = "none"  # model of the camera of a view without ground truth
+_GRID = 0.5  # px that a point map may be off the pinhole that fits it
+_ONE_SURFACE = 0.02  # of depth; neighbours that differ by more are not interpolated
+
+
+@dataclass(frozen=True)
+class PointMap:
+    """An organised point map and how its camera stands to the ToF camera."""
+
+    points: NDArray[np.float32]  #: (SH, SW, 3) metres; NaN: not measured.
+    camera: Camera  #: A pinhole.
+    T_tof_stereo: Float64  #: (4, 4)
+    model: str  #: What it was made of; :data:`NONE` when there is no ground truth.
+
+
+def point_map(view: Planned, said: Said, tof: Camera) -> PointMap:
+    """Make the point map of a view.
+
+    Without ground truth it is empty, on the grid of the ToF camera. Raises :class:`DataError` or :class:`ConfigError`: units,
+    shapes or frames that cannot be, with what to write into ``import.toml``.
+    """
+    pinhole = Camera(tof.width, tof.height, tof.fx, tof.fy, tof.cx, tof.cy)
+    if view.truth is None:
+        return PointMap(np.full((*tof.shape, 3), np.nan, np.float32), pinhole, np.eye(4), NONE)
+    where = view.pieces[-1].name
+    values, kind = view.truth(), str(said.truth.get("kind", ""))
+    if values.ndim == 3 and 1 in (values.shape[0], values.shape[-1]):
+        values = values.reshape([n for n in values.shape if n > 1])
+    if values.ndim == 3 and values.shape[0] == 3 and values.shape[-1] != 3:
+        values = np.moveaxis(values, 0, -1)
+    if not kind:
+        kind = (
+            "points" if values.ndim == 3 and values.shape[-1] == 3 and values.dtype.kind == "f" else "depth"
+        )
+    T = said.transform("T_tof_truth")
+    unit = str(said.truth.get("unit", "") or view.truth_facts.unit)
+    missing = said.tuple_of("truth", "missing")
+    camera = said.truth_camera() or view.truth_facts.camera
+    if kind == "points":
+        return _of_points(values, unit, missing, camera, T, where)
+    depth = metres(values, unit, missing, where)
+    return _of_depth(depth, kind == "radial", camera, T, tof, where)
+
+
+def _of_depth(
+    depth: Float32, radial: bool, camera: Camera | None, T: Float64 | None, tof: Camera, where: str
+) -> PointMap:
+    """Lift a depth image (H, W), metres, of the ToF camera or of one of its own."""
+    if camera is None and depth.shape != tof.shape:
+        turned = " turned" if depth.shape == tof.shape[::-1] else ""
+        raise DataError(
+            f"{where}: expected depth in the ToF image, {tof.shape}, got {depth.shape}{turned}",
+            hint="[truth] axes says that rows and columns have changed places"
+            if turned
+            else "of another camera? [truth.camera] width, height, fx, fy, cx, cy and [truth] T_tof_truth in import.toml",
+        )
+    if camera is not None and depth.shape != camera.shape:
+        raise DataError(
+            f"{where}: expected depth of {camera.shape} as its camera says, got {depth.shape}",
+            hint="[truth.camera] has the intrinsics of this very image",
+        )
+    if camera is not None and T is None:
+        raise ConfigError(
+            f"{where}: where its camera stands is not known: missing [truth] T_tof_truth",
+            hint="the (4, 4) that maps its frame to the ToF frame, metres; rows of numbers in import.toml",
+        )
+    own = camera or tof
+    z = depth / own.ray_lengths.astype(np.float32) if radial else depth
+    z = rectified(z, own)
+    pinhole = Camera(own.width, own.height, own.fx, own.fy, own.cx, own.cy)
+    points = (z[..., None] * pinhole.rays).astype(np.float32)
+    return PointMap(points, pinhole, np.eye(4) if T is None else T, "imported depth")
+
+
+def rectified(depth: Float32, camera: Camera) -> Float32:
+    """Resample depth (H, W) of a camera with a lens on the grid of its pinhole; between pixels of one surface it is interpolated."""
+    if not camera.distortion:
+        return depth
+    H, W = camera.shape
+    v, u = np.mgrid[0:H, 0:W]
+    xy = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
+    seen = distorted(xy, camera.distortion)
+    x, y = seen[..., 0] * camera.fx + camera.cx, seen[..., 1] * camera.fy + camera.cy
+    there = (x > -0.5) & (x < W - 0.5) & (y > -0.5) & (y < H - 0.5)
+    c, r = np.clip(np.rint(x), 0, W - 1).astype(int), np.clip(np.rint(y), 0, H - 1).astype(int)
+    nearest = np.where(there, depth[r, c], np.float32(np.nan))
+    c, r = np.clip(np.floor(x), 0, W - 2).astype(int), np.clip(np.floor(y), 0, H - 2).astype(int)
+    a, b = np.clip(x - c, 0, 1), np.clip(y - r, 0, 1)
+    four = np.stack([depth[r, c], depth[r, c + 1], depth[r + 1, c], depth[r + 1, c + 1]])
+    shares = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        between = 1 / (shares / four).sum(axis=0)  # inverse depth is linear on a plane
+        one = np.ptp(four, axis=0) < _ONE_SURFACE * nearest
+    return np.where(one, between, nearest).astype(np.float32)
+
+
+def _of_points(
+    values: NDArray[Any],
+    unit: str,
+    missing: tuple[float, ...],
+    camera: Camera | None,
+    T: Float64 | None,
+    where: str,
+) -> PointMap:
+    """Take an organised point map (H, W, 3)."""
+    if values.ndim != 3 or values.shape[-1] != 3:
+        raise DataError(
+            f"{where}: expected an organised point map (H, W, 3), got shape {values.shape}",
+            hint='a cloud without rows and columns is kind = "mesh"; a depth image is kind = "depth"',
+        )
+    points = np.asarray(values, dtype=np.float64)
+    empty = ~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)
+    depth = metres(np.where(empty, 0.0, points[..., 2]), unit, missing, where)
+    scale = np.nanmedian(depth / np.where(empty, np.nan, points[..., 2]))
+    points = (points * scale).astype(np.float32)
+    points[~np.isfinite(depth)] = np.nan
+    fitted = camera or pinhole_of(points, where)
+    if T is None:
+        raise ConfigError(
+            f"{where}: where its camera stands is not known: missing [truth] T_tof_truth",
+            hint="the (4, 4) that maps its frame to the ToF frame, metres; of one and the same camera it has ones on the diagonal",
+        )
+    return PointMap(points, fitted, T, "imported points")
+
+
+def pinhole_of(points: NDArray[np.float32], where: str) -> Camera:
+    """Fit the pinhole that an organised point map (H, W, 3) is seen by; :class:`DataError` when none fits within half a pixel."""
+    H, W = points.shape[:2]
+    v, u = np.mgrid[0:H, 0:W]
+    there = np.isfinite(points).all(axis=-1)
+    if there.sum() < 50:
+        raise DataError(f"{where}: expected points, got {int(there.sum())}", hint="is another array meant?")
+    p = points[there].astype(np.float64)
+    fits, off = [], 0.0
+    for pixel, along in ((u[there], p[:, 0]), (v[there], p[:, 1])):
+        A = np.stack([along / p[:, 2], np.ones(len(p))], axis=1)
+        found = np.linalg.lstsq(A, pixel.astype(np.float64), rcond=None)[0]
+        off = max(off, float(np.median(np.abs(A @ found - pixel))))
+        fits += found.tolist()
+    fx, cx, fy, cy = fits
+    if off > _GRID or fx <= 0 or fy <= 0:
+        hint = (
+            "is x right, y down, z forward? else: is the map rectified? [truth.camera] names its intrinsics"
+        )
+        raise DataError(
+            f"{where}: expected points of a pinhole camera, got ones that miss the best by {off:.1f} px (fx {fx:.0f}, fy {fy:.0f})",
+            hint,
+        )
+    return Camera(W, H, fx, fy, cx, cy)

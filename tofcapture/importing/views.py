@@ -1,0 +1,241 @@
+"""Import a source: every view is read, judged and sealed; a scene appears whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture import __version__
+from tofcapture.errors import ConfigError, DataError
+from tofcapture.files.disk import check_writable
+from tofcapture.files.seal import digest_once, fsync, write_text
+from tofcapture.files.view import read_view, view_path, write_view
+from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, View
+from tofcapture.importing.overlap import Overlap, compare
+from tofcapture.importing.plan import Planned, plan
+from tofcapture.importing.rules import check_taps, check_unit, expect_finite, signed
+from tofcapture.importing.said import NAME, Said, read_said
+from tofcapture.importing.truth import point_map
+from tofcapture.poses import Float64
+from tofcapture.rig import Rig, dumps_rig, load_rig
+
+Progress = Callable[[str, int, int], None]
+"""Called with a scene, views done, views in all."""
+STANDING: Float64 = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Pose of a camera of which nobody says where it stands: level, looking along y of a base whose z is up."""
+UNFINISHED = "importing"
+"""Folder of a recording in which scenes are made."""
+
+
+@dataclass
+class Imported:
+    """Report what an import did."""
+
+    recording: Path
+    scenes: dict[str, int] = field(default_factory=dict)  #: Views by scene.
+    skipped: list[str] = field(default_factory=list)  #: Scenes that were there already.
+    warnings: list[str] = field(default_factory=list)  #: What looks wrong and may be right.
+    missing: list[str] = field(
+        default_factory=list
+    )  #: What these data do not have: ground truth, poses, stamps.
+
+
+def said_of(source: Path, config: Path | None = None) -> Said:
+    """Read what is said of a source: ``config``, or the ``import.toml`` in it or beside it, or nothing."""
+    beside = (source if source.is_dir() else source.parent) / NAME
+    if config is None and not beside.is_file():
+        return Said()
+    return read_said(config or beside)
+
+
+def import_data(
+    sources: Sequence[str | Path],
+    out: str | Path,
+    said: Said | None = None,
+    progress: Progress = lambda _scene, _done, _total: None,
+) -> Imported:
+    """Turn data that others took into a recording of sealed views, with its ``rig.toml``.
+
+    Run again it goes on where it was; scenes that are there are left alone.
+
+    Parameters
+    ----------
+    sources
+        Files and folders; each is one scene, or has several in it.
+    out
+        The recording. Further imports of the same cameras may go into the same one.
+    said
+        What the files do not say; by default the ``import.toml`` in each source.
+    progress
+        Told after each view.
+
+    Raises
+    ------
+    DataError
+        Something in the source cannot be what it should be; the message names it, and what to do. The scene does not appear.
+    ConfigError
+        ``import.toml`` lacks something, a scene of that name is there and is another one, or the recording is of other cameras.
+    """
+    out = Path(out)
+    check_writable(out, "name another folder: --out")
+    planned: list[tuple[Planned, Said]] = []
+    for source in map(Path, sources):
+        told = said_of(source) if said is None else said
+        planned += [(view, told) for view in plan(source, told)]
+    scenes: dict[str, list[tuple[Planned, Said]]] = {}
+    for view, told in planned:
+        scenes.setdefault(view.scene, []).append((view, told))
+    result = Imported(out)
+    todo = {s: views for s, views in scenes.items() if not _is_there(out, s, views, result)}
+    for scene in todo:
+        (out / UNFINISHED / scene).mkdir(parents=True, exist_ok=True)
+    done = 0
+    for scene, views in todo.items():
+        for number, (view, told) in enumerate(views):
+            _import_view(out, replace(view, index=number), told, result)
+            done += 1
+            progress(scene, done, sum(map(len, todo.values())))
+        _publish(out, scene)
+        result.scenes[scene] = len(views)
+    for left in (out / UNFINISHED).glob("*") if not todo or (out / UNFINISHED).is_dir() else ():
+        result.warnings.append(
+            f"{left}: an import of this scene was begun and not finished; import it again, or delete it"
+        )
+    if (out / UNFINISHED).is_dir() and not any((out / UNFINISHED).iterdir()):
+        (out / UNFINISHED).rmdir()
+    return result
+
+
+def inputs_of(view: Planned, said: Said) -> dict[str, Any]:
+    """Digest everything that a view is made of: files by name, and what was said."""
+    files = {p.name: digest_once(p.path) if p.path.is_file() else "" for p in view.pieces}
+    told = {name: getattr(said, name) for name in ("tof", "raw", "truth", "poses")}
+    text = json.dumps([files, told, __version__], sort_keys=True, default=str)
+    return {"files": files, "digest": hashlib.sha256(text.encode()).hexdigest()}
+
+
+def _is_there(out: Path, scene: str, views: Sequence[tuple[Planned, Said]], result: Imported) -> bool:
+    """Tell whether a scene was imported from these very inputs; :class:`ConfigError` when it was from others."""
+    if not view_path(out, scene, 0).parent.is_dir():
+        return False
+    for number, (view, told) in enumerate(views):
+        path = view_path(out, scene, number)
+        if not path.is_file() or read_view(path).provenance.get("import") != inputs_of(view, told):
+            raise ConfigError(
+                f"{out}: holds a scene {scene} already, and {path.name} is not of these data",
+                hint=f"import into another folder: --out, give it another name: --scene, or delete {path.parent} first",
+            )
+    result.skipped.append(scene)
+    result.scenes[scene] = len(views)
+    return True
+
+
+def _import_view(out: Path, planned: Planned, said: Said, result: Imported) -> None:
+    """Make one view in the folder of unfinished scenes, unless it is there already."""
+    path = out / UNFINISHED / planned.scene / view_path(out, planned.scene, planned.index).name
+    inputs = inputs_of(planned, said)
+    if path.is_file():
+        try:
+            if read_view(path).provenance.get("import") == inputs:
+                return
+        except DataError:
+            pass  # made by a run that was killed, and damaged since: it is made again
+    view, overlap = make_view(planned, said)
+    for text in (
+        *overlap.warnings,
+        *([] if planned.truth else [f"{planned.scene}: no ground truth: predict only"]),
+    ):
+        if text not in result.warnings:
+            result.warnings.append(text)
+    _keep_rig(out, view.rig, overlap.model)
+    write_view(path, replace(view, provenance={"import": inputs, "tofcapture": __version__}))
+
+
+def make_view(planned: Planned, said: Said) -> tuple[View, Overlap]:
+    """Make one view and say how its ground truth lies over the ToF image; raises as :func:`import_data` does."""
+    where = planned.pieces[0].name
+    raw = integers(planned.raw(), where)
+    info = said.tof_info(planned.facts, (raw.shape[-2], raw.shape[-1]))
+    warning = judged(raw, info, where)
+    found = point_map(planned, said, info.camera)
+    rig = Rig(info.camera, found.camera, found.T_tof_stereo, np.eye(4), info.illuminator, (), info.reach)
+    stamps = planned.time_ns if len(planned.time_ns) == len(raw) else tuple(range(len(raw)))
+    pose = STANDING if planned.T_world_tof is None else planned.T_world_tof
+    arm = ArmState(np.full(6, np.nan), pose, stamps[0])
+    celsius = said.raw.get("celsius", planned.facts.celsius)
+    view = View(
+        planned.scene,
+        planned.index,
+        TofBurst(
+            raw, np.asarray(stamps, np.int64), np.full(len(raw), np.nan if celsius is None else celsius), info
+        ),
+        StereoFrame(found.points, stamps[0], StereoInfo(found.model, "", found.camera)),
+        arm,
+        replace(arm, time_ns=stamps[-1]),
+        rig,
+    )
+    overlap = compare(view, where, found.model)
+    return view, replace(overlap, warnings=(*([warning] if warning else []), *overlap.warnings))
+
+
+def integers(raw: NDArray[Any], where: str) -> NDArray[Any]:
+    """Bring taps (F, K, H, W) into uint16 or int16 as the sensor gave them; :class:`DataError` when nobody could.
+
+    Floats that hold whole numbers are those; other floats stay, as float64.
+    """
+    if raw.dtype.kind not in "iuf" or raw.dtype.itemsize == 1:
+        raise DataError(
+            f"{where}: expected counts of more than 8 bits, got {raw.dtype}",
+            hint="8 bits are a picture of the taps; export 16 bits",
+        )
+    if raw.dtype.kind == "f":
+        expect_finite(raw, where)
+        if (raw != np.rint(raw)).any():
+            return raw.astype(np.float64)
+        raw = raw.astype(np.int64) if np.abs(raw).max(initial=0) < 2**62 else raw
+    raw = signed(raw)
+    low, high = int(raw.min(initial=0)), int(raw.max(initial=0))
+    kind = np.uint16 if low >= 0 else np.int16
+    if low < np.iinfo(kind).min or high > np.iinfo(kind).max:
+        raise DataError(
+            f"{where}: expected counts of 16 bits, got {low} to {high}",
+            hint="is another array meant? [raw] files; or another byte order: [raw] dtype",
+        )
+    return raw.astype(kind)
+
+
+def judged(raw: NDArray[Any], info: TofInfo, where: str) -> str:
+    """Refuse taps (F, K, H, W) that cannot be what ``info`` says; return what looks wrong and may be right."""
+    expect_finite(raw, where)
+    warning = check_unit(raw, info, where)
+    check_taps(raw.mean(axis=0, dtype=np.float64), info, where)
+    return warning
+
+
+def _keep_rig(out: Path, rig: Rig, model: str) -> None:
+    """Write the recording's rig, once; :class:`ConfigError` when it holds another one."""
+    path = out / "rig.toml"
+    if model == "none" and path.is_file():
+        return
+    if not path.is_file():
+        write_text(path, dumps_rig(rig))
+    elif dumps_rig(load_rig(path)) != dumps_rig(rig):
+        raise ConfigError(
+            f"{path}: the recording has other cameras than these data",
+            hint="import them into another folder: --out; build-dataset takes several recordings",
+        )
+
+
+def _publish(out: Path, scene: str) -> None:
+    """Give a whole scene its place among the views."""
+    made, place = out / UNFINISHED / scene, view_path(out, scene, 0).parent
+    place.parent.mkdir(parents=True, exist_ok=True)
+    made.replace(place)
+    fsync(place.parent)
