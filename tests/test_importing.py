@@ -8,7 +8,7 @@ import pytest
 from tofcapture.cli import main
 from tofcapture.errors import TofError
 from tofcapture.files.check import check
-from tofcapture.files.view import find_views, read_view
+from tofcapture.files.view import find_views, open_view
 from tofcapture.importing.said import Said
 from tofcapture.importing.views import UNFINISHED, import_data
 
@@ -39,7 +39,7 @@ def scenes(views=3):
 def imported(source, out, **said):
     """Views that a source becomes, in order."""
     import_data([source], out, Said(**{"tof": TOF, **said}))
-    return [read_view(p) for views in find_views(out).values() for p in views]
+    return [open_view(p) for views in find_views(out).values() for p in views]
 
 
 def test_a_folder_of_arrays_becomes_a_recording(tmp_path):
@@ -50,7 +50,7 @@ def test_a_folder_of_arrays_becomes_a_recording(tmp_path):
         np.save(tmp_path / f"depth_{i}.npy", depth[i])
     words = ["import", str(tmp_path), "--out", str(tmp_path / "rec"), "--camera", "45,46,19,15.5"]
     assert main(words) == 0
-    views = [read_view(p) for p in find_views(tmp_path / "rec")[tmp_path.name]]
+    views = [open_view(p) for p in find_views(tmp_path / "rec")[tmp_path.name]]
     for i, view in enumerate(views):
         np.testing.assert_array_equal(view.tof.raw[0], raw[i])
         np.testing.assert_array_equal(view.stereo.points[..., 2], depth[i])

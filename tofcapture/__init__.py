@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from tofcapture.devices.sim.world import simulate
     from tofcapture.files.shard import open_shard
     from tofcapture.files.view import open_view
+    from tofcapture.importing.views import import_data
     from tofcapture.record.recorder import record
     from tofcapture.rig import load_rig
 
@@ -29,6 +30,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Dataset",
     "build_dataset",
+    "import_data",
     "load_rig",
     "open_dataset",
     "open_shard",
@@ -40,6 +42,7 @@ __all__ = [
 _HOMES = {
     "Dataset": "dataset.reader",
     "build_dataset": "dataset.build",
+    "import_data": "importing.views",
     "load_rig": "rig",
     "open_dataset": "dataset.reader:Dataset",
     "open_shard": "files.shard",

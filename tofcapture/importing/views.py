@@ -16,7 +16,7 @@ from tofcapture import __version__
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.disk import check_writable
 from tofcapture.files.seal import digest_once, fsync, write_text
-from tofcapture.files.view import read_view, view_path, write_view
+from tofcapture.files.view import open_view, view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, View
 from tofcapture.importing.overlap import Overlap, compare
 from tofcapture.importing.plan import Planned, plan
@@ -127,7 +127,7 @@ def _is_there(out: Path, scene: str, views: Sequence[tuple[Planned, Said]], resu
         return False
     for number, (view, told) in enumerate(views):
         path = view_path(out, scene, number)
-        if not path.is_file() or read_view(path).provenance.get("import") != inputs_of(view, told):
+        if not path.is_file() or open_view(path).provenance.get("import") != inputs_of(view, told):
             raise ConfigError(
                 f"{out}: holds a scene {scene} already, and {path.name} is not of these data",
                 hint=f"import into another folder: --out, give it another name: --scene, or delete {path.parent} first",
@@ -143,7 +143,7 @@ def _import_view(out: Path, planned: Planned, said: Said, result: Imported) -> N
     inputs = inputs_of(planned, said)
     if path.is_file():
         try:
-            if read_view(path).provenance.get("import") == inputs:
+            if open_view(path).provenance.get("import") == inputs:
                 return
         except DataError:
             pass  # made by a run that was killed, and damaged since: it is made again
