@@ -75,10 +75,10 @@ def _configure_export(parser: argparse.ArgumentParser) -> None:
     add(
         "--format",
         required=True,
-        choices=("ply", "png16", "mcap"),
+        choices=("ply", "png16", "mcap", "bop", "nerfstudio", "lerobot", "huggingface"),
         dest="kind",
         metavar="FORMAT",
-        help="ply, png16 or mcap",
+        help="ply, png16, mcap, bop, nerfstudio, lerobot or huggingface",
     )
     add("--out", type=Path, required=True, metavar="DIR", help="folder; completed if it was begun")
     step = "step of PNG depth up to 8.19 m (default: 0.000125)"
@@ -125,7 +125,7 @@ PACK = Command(
     run=_pack,
 )
 EXPORT = Command(
-    help="export a dataset or a shard as point clouds, 16-bit PNG depth or MCAP",
+    help="export a dataset or a shard as point clouds, PNG depth, MCAP, or for BOP, nerfstudio, LeRobot, Hugging Face",
     example="tofcapture export-dataset datasets/first --format ply --out clouds",
     configure=_configure_export,
     run=_export,
