@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -63,7 +63,7 @@ def record(
     turns: int = 1,
     retake: int | None = None,
 ) -> RecordResult:
-    """Take every missing view of one scene.
+    """Take every missing view of one scene: move, expose, judge, seal.
 
     It can be killed at any moment and run again: views that are sealed stay, the others are taken. On the simulated station
     the arrays are those of a run that was never killed.
@@ -82,29 +82,28 @@ def record(
     retake
         Number of a view to take again, and no other. The one before is set aside when the new one is there.
 
-    Raises
-    ------
-    ConfigError
-        The recording was begun with other cameras, frames or poses; the operator cannot turn objects; no such view.
-    DiskFull
-        The disk is too small, or full.
-    BusyError
-        Another recorder is at work on this recording, or moves this arm.
-    DeviceError
-        Two views in a row failed three times each; or the last one did, for the first time: the device may be broken. An arm,
-        or a driver's process, is in a state that needs a person.
-    ConfigError
-        A driver hands over what its description or the units exclude; or the folder is another one now.
-    Stopped
-        The observer, ``tofcapture stop``, or a stop of the arm, ended the run.
+    Raises :class:`ConfigError`: the recording was begun with other cameras, frames or poses, the operator cannot turn objects,
+    there is no such view, a driver breaks its promises, or a folder is another one now; :class:`DiskFull`; :class:`BusyError`:
+    another recorder works on this recording, or moves this arm; :class:`DeviceError`: two views in a row failed three times each,
+    or the last one for the first time, or a device needs a person; :class:`Stopped`: the observer, ``tofcapture stop``, or a stop
+    of the arm.
     """
     if station is None or isinstance(station, str | Path):
         with open_station(None if station is None else Path(station)) as opened:
             return record(opened, scene, recording, views, frames, progress, observer, turns, retake)
+    plan = plan_scene(station, scene, views, turns)
+    _check_request(station, plan, frames, retake)
+    with _begun(station, scene, Path(recording), frames, plan, observer or Observer()) as run:
+        for planned in run.missing(retake, progress or (lambda _there, _planned: None)):
+            run.place_object(planned)
+            run.take(planned)
+        run.judge_the_last()
+    return run.result()
+
+
+def _check_request(station: Station, plan: Plan, frames: int, retake: int | None) -> None:
     if frames < 1:
         raise ConfigError(f"frames: expected at least 1, got {frames}")
-    recording, observer = Path(recording), observer or Observer()
-    plan = plan_scene(station, scene, views, turns)
     if any(view.turn for view in plan.views) and not station.operator.can_turn:
         raise ConfigError(
             "turns: this station's operator cannot turn the object",
@@ -112,6 +111,13 @@ def record(
         )
     if retake is not None and retake not in {view.index for view in plan.views}:
         raise JobRefused(f"retake: expected a view from 0 to {len(plan.views) - 1}, got {retake}")
+
+
+@contextmanager
+def _begun(
+    station: Station, scene: str, recording: Path, frames: int, plan: Plan, observer: Observer
+) -> Iterator[_Run]:
+    """Hold the recording and the arm, bring the journal up to date; stops and full disks end the run by name."""
     with (
         full_disk_named(recording),
         stoppable(f"{scene} into {recording.absolute()}", station.arm.stop) as stop,
@@ -130,22 +136,11 @@ def record(
             failed_before = {row.index for row in journal.rows(scene) if row.state == "failed"}
             kept = journal.expect(scene, {view.index: view.digest for view in plan.views})
             observer.planned(plan, kept, repaired)
-            run = _Run(station, scene, recording, frames, plan, journal, observer, stop, folders)
             check_tof_info(station.tof.describe())
-            again = kept if retake is None else {view.index for view in plan.views} - {retake}
-            missing = [view for view in plan.views if view.index not in again]
-            for n, planned in enumerate(missing):
-                if progress:
-                    progress(len(kept) + n - len(run.reasons), len(plan.views))
-                observer.before_view(planned.index)
-                folders.check()
-                check_space(recording, len(missing) - n)
-                run.place_object(planned)
-                run.take(planned)
-            run.judge_the_last(failed_before)
-            if progress:
-                progress(len(plan.views) - len(run.reasons), len(plan.views))
-    return run.result(kept, repaired)
+            yield _Run(
+                *(station, scene, recording, frames, plan, journal, observer, stop, folders),
+                *(kept, repaired, failed_before),
+            )
 
 
 @dataclass
@@ -161,12 +156,27 @@ class _Run:
     observer: Observer
     stop: Stop
     folders: HeldFolders
+    kept: set[int]  # sealed by earlier runs
+    repaired: list[str]
+    failed_before: set[int]
     turned: float | None = None  # how the object stands; after an earlier run nobody knows
     failed_in_a_row: int = 0
     last_error: DeviceError | None = None
     recorded: list[int] = field(default_factory=list)
     reasons: dict[int, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+
+    def missing(self, retake: int | None, progress: Progress) -> Iterator[PlannedView]:
+        """Go through the views to take; before each the observer may wait, and folders and disk are looked at."""
+        views = self.plan.views
+        left = [v for v in views if (v.index not in self.kept if retake is None else v.index == retake)]
+        for n, planned in enumerate(left):
+            progress(len(self.kept) + n - len(self.reasons), len(views))
+            self.observer.before_view(planned.index)
+            self.folders.check()
+            check_space(self.recording, len(left) - n)
+            yield planned
+        progress(len(views) - len(self.reasons), len(views))
 
     def place_object(self, planned: PlannedView) -> None:
         """Have the object put on the table, and turned where the plan turns it."""
@@ -177,7 +187,7 @@ class _Run:
         self.turned = planned.turn
 
     def take(self, planned: PlannedView) -> None:
-        """Move, expose, check and seal, in three attempts at most; else give the view up.
+        """Move, expose, judge and seal, in three attempts at most; else give the view up.
 
         Raises :class:`DeviceError`: this view and the one before it failed.
         """
@@ -186,20 +196,16 @@ class _Run:
             try:
                 before = self.move(planned)
                 tof, stereo, after = self.expose(planned)
-                numbers = self.check(tof, stereo, before, after)
+                numbers = self.judge(tof, stereo, before, after)
             except MotionStopped as err:
                 # No fault of the view: it is taken when somebody asks again.
-                raise Stopped(
-                    err.message, hint="look at the arm; ask for the same scene again to go on"
-                ) from err
+                hint = "look at the arm; ask for the same scene again to go on"
+                raise Stopped(err.message, hint=hint) from err
             except DeviceError as err:
                 self.stop.check()
                 # A refused motion is refused for good.
                 if attempt == ATTEMPTS or isinstance(err, MotionRefused):
-                    self.give_up(planned.index, err)
-                    if isinstance(err, ArmFault):
-                        raise  # that is no fault of the view: the next one would meet it as well
-                    return
+                    return self.give_up(planned.index, err)
                 continue
             broken = broken_limits(numbers)
             if attempt == ATTEMPTS or not any(limit.action == RETAKE for limit in broken):
@@ -208,6 +214,7 @@ class _Run:
         provenance = {**self.provenance(planned), "quality": quality_table(numbers)}
         truth, rig = self.station.operator.truth(), self.station.rig
         self.seal(View(self.scene, planned.index, tof, stereo, before, after, rig, provenance, truth))
+        return None
 
     def move(self, planned: PlannedView) -> ArmState:
         """Move by a clear way; the arm returns settled."""
@@ -230,7 +237,7 @@ class _Run:
         stereo = self.station.stereo.capture()
         return tof, stereo, self.station.arm.state()
 
-    def check(
+    def judge(
         self, tof: TofBurst, stereo: StereoFrame, before: ArmState, after: ArmState
     ) -> dict[str, float]:
         """Refuse what is not what a driver promises, measure what came, refuse what is of no use (``record.quality``)."""
@@ -268,15 +275,16 @@ class _Run:
         self.reasons[index] = error.message
         self.last_error = error
         self.failed_in_a_row += 1
-        if self.failed_in_a_row >= FAILURES_IN_A_ROW:
+        # A fault of the arm is no fault of the view: the next one would meet it as well.
+        if self.failed_in_a_row >= FAILURES_IN_A_ROW or isinstance(error, ArmFault):
             raise error
 
-    def judge_the_last(self, failed_before: set[int]) -> None:
+    def judge_the_last(self) -> None:
         """Raise when the last view failed, and never before: no view after it shows that the devices work."""
-        error, own = self.last_error, (MotionRefused, Refused)
-        known = failed_before & self.reasons.keys()
-        if self.failed_in_a_row and error is not None and not isinstance(error, own) and not known:
-            raise error
+        known = self.failed_before & self.reasons.keys()
+        if self.failed_in_a_row and not isinstance(self.last_error, MotionRefused | Refused) and not known:
+            assert self.last_error is not None
+            raise self.last_error
 
     def begin(self, index: int, step: str) -> None:
         """Journal a step of a view, before anything is done; raise :class:`Stopped` when nothing shall be done."""
@@ -301,9 +309,9 @@ class _Run:
             "utc": utc_now(),
         }
 
-    def result(self, kept: set[int], repaired: list[str]) -> RecordResult:
+    def result(self) -> RecordResult:
         """Sum up."""
-        recorded, there, failed = (tuple(sorted(n)) for n in (self.recorded, kept, self.reasons))
+        recorded, kept, failed = (tuple(sorted(n)) for n in (self.recorded, self.kept, self.reasons))
         reasons = tuple(f"view {i}: {self.reasons[i]}" for i in failed)
-        notes = tuple(self.notes)
-        return RecordResult(self.scene, recorded, there, failed, reasons, tuple(repaired), self.plan, notes)
+        repaired, notes = tuple(self.repaired), tuple(self.notes)
+        return RecordResult(self.scene, recorded, kept, failed, reasons, repaired, self.plan, notes)
