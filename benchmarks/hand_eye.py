@@ -16,9 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.hand_eye.closed_form import invert_all
 from calibration.hand_eye.solve import solve_hand_eye
-from tofcapture.poses import exp, invert, look_at, rotation_angle, rotation_exp, rotation_log, transform
+from tofcapture.poses import (
+    exp,
+    invert,
+    invert_all,
+    look_at,
+    rotation_angle,
+    rotation_exp,
+    rotation_log,
+    transform,
+)
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "realdata"
 # Noise per axis: hand metres and radians, target metres (x, y), metres along the axis, radians.

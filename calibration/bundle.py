@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from calibration.alignment.averages import average_transforms
 from calibration.hand_eye.checks import check_motion, clean
-from calibration.hand_eye.closed_form import hats, invert_all, moved, park_martin, rotation_vectors
+from calibration.hand_eye.closed_form import hats, moved, park_martin, rotation_vectors
 from tofcapture.errors import QualityError
-from tofcapture.poses import Float64, exp, hat, invert, log, rotation_log
+from tofcapture.poses import Float64, exp, hat, invert, invert_all, log, rotation_log
 from tofcapture.rig import Rig
 
 CAMERAS = ("tof", "stereo")

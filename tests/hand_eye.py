@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.hand_eye.closed_form import invert_all
 from calibration.hand_eye.pairs import make_stream
-from tofcapture.poses import exp, invert, look_at, rotation_angle, rotation_exp, transform
+from tofcapture.poses import exp, invert, invert_all, look_at, rotation_angle, rotation_exp, transform
 
 
 def station(seed=0, count=25, noise_m=0.0005, noise_rad=0.001, eye_to_hand=False):

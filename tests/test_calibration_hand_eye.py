@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from calibration.hand_eye import clocks
 from calibration.hand_eye.checks import Cause, HandEyeRefused
-from calibration.hand_eye.closed_form import invert_all, park_martin, residuals, rotation_bound, shah
+from calibration.hand_eye.closed_form import park_martin, residuals, rotation_bound, shah
 from calibration.hand_eye.files import read_pairs, read_poses
 from calibration.hand_eye.pairs import make_stream, stream_pairs
 from calibration.hand_eye.readings import agreed
@@ -20,7 +20,7 @@ from calibration.hand_eye.refine import jacobian, refined_from_consensus
 from calibration.hand_eye.solve import solve_hand_eye, to_dict
 from tests.hand_eye import apart, station, streams
 from tofcapture.errors import DataError
-from tofcapture.poses import exp, invert, rotation_exp, rotation_log, transform
+from tofcapture.poses import exp, invert, invert_all, rotation_exp, rotation_log, transform
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "realdata"
 MOVEIT = REAL / "hand_eye_moveit" / "pose_samples.json"

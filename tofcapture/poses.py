@@ -53,6 +53,15 @@ def invert(T: Float64) -> Float64:
     return transform(rotation, -rotation @ T[:3, 3])
 
 
+def invert_all(T: Float64) -> Float64:
+    """Invert rigid transforms (..., 4, 4)."""
+    out = np.zeros_like(T)
+    out[..., :3, :3] = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, 3] = -(out[..., :3, :3] @ T[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1
+    return out
+
+
 def transform_points(T: Float64, points: NDArray[np.floating]) -> Float64:
     """Map points (..., 3) by ``T``; NaN stays NaN."""
     moved: Float64 = rotate_vectors(T, points) + T[:3, 3]

@@ -13,7 +13,7 @@ from calibration.cli.sensor import add_recording, believed_rig, read_views, save
 from tofcapture.cli import kit
 from tofcapture.cli.kit import Outcome
 from tofcapture.errors import DataError, QualityError, UsageError
-from tofcapture.poses import Float64, rotation_log
+from tofcapture.poses import Float64, invert_all, rotation_log
 
 if TYPE_CHECKING:
     from calibration.board.geometry import Board
@@ -103,7 +103,7 @@ def _pairs(args: argparse.Namespace) -> tuple[Float64, Float64, dict[str, Any]]:
     paths = args.inputs
     if len(paths) == 1 and paths[0].is_dir() and args.board:
         hand, target, refused = _board_pairs(paths[0], args.board)
-        return hand, _turned(target, args), {"camera": "tof", "refused": refused}, None
+        return hand, _turned(target, args), {"camera": "tof", "refused": refused}
     if len(paths) == 1 and paths[0].is_dir():
         with kit.progress() as progress:
             hand, target = recording_pairs(paths[0], progress)
@@ -164,7 +164,6 @@ def _board_pairs(recording: Path, name: str) -> tuple[Float64, Float64, list[str
 
 def _turned(target: Float64, args: argparse.Namespace) -> Float64:
     from calibration.hand_eye.checks import clean
-    from calibration.hand_eye.closed_form import invert_all
 
     return invert_all(clean(target, "target poses")) if args.inverted_target else target
 

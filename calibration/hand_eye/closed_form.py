@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.poses import Float64, rotation_exp, transform
+from tofcapture.poses import Float64, invert_all, rotation_exp, transform
 
 NEAR_PI = np.radians(170)  # beyond it the sign of a rotation vector is noise
 SCALE = (
@@ -25,15 +25,9 @@ QUANTILE_SIGMA = 1.37  # 40 % of 3-D Gaussian vectors are shorter than this many
 INLIER = 5.0  # sigma per axis; a 3-D Gaussian vector is longer in 1 of 60,000
 FLOOR = 0.02  # of SCALE: what no pair is called an outlier for
 POLISH = 4
-
-
-def invert_all(T: Float64) -> Float64:
-    """Invert rigid transforms (..., 4, 4)."""
-    out = np.zeros_like(T)
-    out[..., :3, :3] = np.swapaxes(T[..., :3, :3], -1, -2)
-    out[..., :3, 3] = -(out[..., :3, :3] @ T[..., :3, 3:])[..., 0]
-    out[..., 3, 3] = 1
-    return out
+SMALLER = 0.9  # of the noise is left where another size of the target is believed
+SIZINGS = 3
+UNSIZED = 5.0  # factor; farther off it is a mistake of units
 
 
 def hats(v: Float64) -> Float64:
@@ -202,3 +196,38 @@ def _agreement(P: Float64, B: Float64, X: Float64, Z: Float64) -> Consensus:
         inliers = np.ones(len(P), dtype=bool)
     rms = [float(np.sqrt(np.mean(np.square(h[inliers])) / 3)) for h in halves]
     return Consensus(X, Z, (rms[0], rms[1]), inliers)
+
+
+def scaled_consensus(P: Float64, B: Float64) -> tuple[Consensus, float]:
+    """Find the consensus of pairs (N, 4, 4), and the factor of the target's distances that it needs.
+
+    The factor is one unless another, no farther than ``UNSIZED``, leaves clearly less noise: it is a start, and a diagnosis of other
+    mistakes is not to take it for noise.
+    """
+    found, scale = consensus(P, B), 1.0
+    for _ in range(SIZINGS):
+        kept = found.inliers
+        factor = scale * linear_scale(P[kept], scaled(B[kept], scale), found.X[:3, :3])
+        if not 1 / UNSIZED < factor < UNSIZED:
+            break
+        other = consensus(P, scaled(B, factor))
+        if other.penalty > SMALLER * found.penalty:
+            break
+        found, scale = other, factor
+    return found, scale
+
+
+def linear_scale(P: Float64, B: Float64, rotation: Float64) -> float:
+    """Find the factor of the target's distances by least squares in (t_X, t_Z, s) of ``R_P t_X - t_Z + s R_P R_X t_B = -t_P``."""
+    n = len(P)
+    left = np.zeros((n, 3, 7))
+    left[:, :, :3], left[:, :, 3:6] = P[:, :3, :3], -np.eye(3)
+    left[:, :, 6] = np.einsum("nij,jk,nk->ni", P[:, :3, :3], rotation, B[:, :3, 3])
+    return float(np.linalg.lstsq(left.reshape(-1, 7), -P[:, :3, 3].reshape(-1), rcond=None)[0][6])
+
+
+def scaled(T: Float64, factor: float | Float64) -> Float64:
+    """Multiply the translations of poses (N, 4, 4), each axis by its own factor where there are three."""
+    out = T.copy()
+    out[:, :3, 3] *= factor
+    return out

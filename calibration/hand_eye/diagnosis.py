@@ -8,16 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.hand_eye.checks import Cause, HandEyeRefused, slide_mismatch, thinned
-from calibration.hand_eye.closed_form import Consensus, consensus, invert_all
-from tofcapture.poses import Float64
+from calibration.hand_eye.closed_form import Consensus, consensus, scaled
+from calibration.hand_eye.readings import Readings
+from tofcapture.poses import Float64, invert_all
 
 BETTER = 3.0  # times less noise: another reading of the numbers is believed
 GOOD = 0.5  # score below which no mistake was made: the smallest motion let through leaves more when misread
 LIMIT = (0.030, np.radians(3.0))  # m, rad per axis: noise beyond which pairs are no calibration
 AGREE = 0.75  # share of the pairs that must agree
-UNSIZED = 5.0  # factor; farther off it is a mistake of units
-SIZINGS = 3
-SMALLER = 0.9  # of the noise is left where another size of the target is believed
 FAIR = 5.0  # fair stations' noise; roles are judged only where the fit is better
 MOUNT = 0.5  # m; mounts on hands are shorter, ways to targets longer
 SECOND = 0.6  # share of the remainder that must agree on a second board
@@ -61,34 +59,6 @@ def check_agreement(A: Float64, B: Float64, found: Consensus, *, eye_to_hand: bo
     )
 
 
-def scaled_consensus(P: Float64, B: Float64) -> tuple[Consensus, float]:
-    """Find the consensus of pairs (N, 4, 4), and the factor of the target's distances that it needs.
-
-    The factor is one unless another, no farther than ``UNSIZED``, leaves clearly less noise: it is a start, and a diagnosis of other
-    mistakes is not to take it for noise.
-    """
-    found, scale = consensus(P, B), 1.0
-    for _ in range(SIZINGS):
-        kept = found.inliers
-        factor = scale * linear_scale(P[kept], scaled(B[kept], scale), found.X[:3, :3])
-        if not 1 / UNSIZED < factor < UNSIZED:
-            break
-        other = consensus(P, scaled(B, factor))
-        if other.penalty > SMALLER * found.penalty:
-            break
-        found, scale = other, factor
-    return found, scale
-
-
-def linear_scale(P: Float64, B: Float64, rotation: Float64) -> float:
-    """Find the factor of the target's distances by least squares in (t_X, t_Z, s) of ``R_P t_X - t_Z + s R_P R_X t_B = -t_P``."""
-    n = len(P)
-    left = np.zeros((n, 3, 7))
-    left[:, :, :3], left[:, :, 3:6] = P[:, :3, :3], -np.eye(3)
-    left[:, :, 6] = np.einsum("nij,jk,nk->ni", P[:, :3, :3], rotation, B[:, :3, 3])
-    return float(np.linalg.lstsq(left.reshape(-1, 7), -P[:, :3, 3].reshape(-1), rcond=None)[0][6])
-
-
 def _in_words(found: Consensus) -> str:
     return f"{1e3 * found.noise[0]:.1f} mm and {np.degrees(found.noise[1]):.2f} deg per axis"
 
@@ -120,16 +90,26 @@ def _mistakes(A: Float64, B: Float64, *, eye_to_hand: bool) -> Iterator[Mistake]
         hint = "the {} translations are in {} while the others are in metres"
         yield Mistake(Cause.WRONG_UNITS, hint.format("target", name), A, scaled(B, metres))
         yield Mistake(Cause.WRONG_UNITS, hint.format("hand", name), scaled(A, metres), B)
-    reordered = (_reordered, Cause.QUATERNION_ORDER, "were read as x, y, z, w and are w, x, y, z")
-    transposed = (
-        _transposed,
-        Cause.ROTATION_INVERTED,
-        "are inverted while its translations are not: JPL or transposed",
-    )
-    for change, cause, what in (reordered, transposed):
-        yield Mistake(cause, f"the hand's rotations {what}", change(A), B)
-        yield Mistake(cause, f"the target's rotations {what}", A, change(B))
-        yield Mistake(cause, f"the rotations of both {what}", change(A), change(B))
+    for name, cause, what in (
+        ("wxyz", Cause.QUATERNION_ORDER, "were read as x, y, z, w and are w, x, y, z"),
+        (
+            "xyzw inverted",
+            Cause.ROTATION_INVERTED,
+            "are inverted while its translations are not: JPL or transposed",
+        ),
+    ):
+        hand, target = _reread(A, name), _reread(B, name)
+        yield Mistake(cause, f"the hand's rotations {what}", hand, B)
+        yield Mistake(cause, f"the target's rotations {what}", A, target)
+        yield Mistake(cause, f"the rotations of both {what}", hand, target)
+
+
+def _reread(T: Float64, name: str) -> Float64:
+    """Take quaternions that were read as x, y, z, w in another reading (:class:`Readings`)."""
+    from scipy.spatial.transform import Rotation
+
+    quaternions = Rotation.from_matrix(T[:, :3, :3]).as_quat()
+    return Readings(T[:, :3, 3], quaternions, (name,)).poses(name, "m")
 
 
 def _inverted(A: Float64, B: Float64, *, eye_to_hand: bool) -> Mistake:
@@ -184,29 +164,6 @@ def _check_roles(A: Float64, B: Float64, found: Consensus, *, eye_to_hand: bool)
 
 def _better_view(other: Float64, B: Float64) -> bool:
     return _in_view(other) >= 0.95 and _off_axis(other) < 0.8 * _off_axis(B)
-
-
-def _reordered(T: Float64) -> Float64:
-    """Take quaternions that were read as x, y, z, w for w, x, y, z."""
-    from scipy.spatial.transform import Rotation
-
-    out = T.copy()
-    q = Rotation.from_matrix(T[:, :3, :3]).as_quat()
-    out[:, :3, :3] = Rotation.from_quat(np.roll(q, -1, axis=1)).as_matrix()
-    return out
-
-
-def _transposed(T: Float64) -> Float64:
-    out = T.copy()
-    out[:, :3, :3] = np.swapaxes(T[:, :3, :3], 1, 2)
-    return out
-
-
-def scaled(T: Float64, factor: float | Float64) -> Float64:
-    """Multiply the translations of poses (N, 4, 4), each axis by its own factor where there are three."""
-    out = T.copy()
-    out[:, :3, 3] *= factor
-    return out
 
 
 def _check_second(P: Float64, B: Float64, found: Consensus) -> None:

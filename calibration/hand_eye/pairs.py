@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibration.hand_eye.checks import Cause, HandEyeRefused, clean, thinned
 from calibration.hand_eye.clocks import LEAST, read_clock
-from calibration.hand_eye.closed_form import invert_all
 from calibration.hand_eye.readings import Meant, Readings, choose
 from calibration.hand_eye.refine import refine, refined_from_consensus
 from calibration.registration.clouds import Cloud, stereo_cloud
@@ -28,7 +27,7 @@ from calibration.registration.pairs import calibration_views
 from calibration.registration.rims import REPEAT, rim_cloud, stereo_rims
 from tofcapture.errors import DataError, QualityError
 from tofcapture.pool import Pool
-from tofcapture.poses import Float64, invert
+from tofcapture.poses import Float64, invert, invert_all
 
 STEP = 0.01  # s between samples of the speed
 WINDOW = 0.1  # s over which a speed is taken: longer than a camera's frame, shorter than a swing of the arm
@@ -133,14 +132,10 @@ def stream_pairs(
     start, correlation = _coarse_offset(hand, target)
     A, B = _pairs_at(hand, target, start)
     # The mount and the sense of the target may be wrong here; the gate says so once the clocks are right.
-    inverted = _log_likelihood(invert_all(A), B) > _log_likelihood(A, B)
-    offset, sigma = _refined_offset(hand, target, start, inverted=inverted)
+    as_given, turned = (refined_from_consensus(P, B).log_likelihood for P in (A, invert_all(A)))
+    offset, sigma = _refined_offset(hand, target, start, inverted=turned > as_given)
     found = {"time_offset_s": offset, "time_offset_sigma_s": sigma, "correlation": correlation, **clocks}
     return *_pairs_at(hand, target, offset), found
-
-
-def _log_likelihood(A: Float64, B: Float64) -> float:
-    return refined_from_consensus(A, B).log_likelihood
 
 
 def _at_times(stream: Stream, seconds: Float64) -> tuple[Float64, NDArray[np.bool_]]:

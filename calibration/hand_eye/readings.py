@@ -15,11 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.hand_eye.checks import Cause, HandEyeRefused, thinned
-from calibration.hand_eye.closed_form import SCALE, distances, invert_all, residuals, rotation_vectors, shah
-from calibration.hand_eye.diagnosis import linear_scale, scaled
+from calibration.hand_eye.closed_form import (
+    SCALE,
+    distances,
+    linear_scale,
+    residuals,
+    rotation_vectors,
+    scaled,
+    shah,
+)
 from calibration.hand_eye.refine import Refined, refined_from_consensus
 from tofcapture.errors import DataError, UsageError
-from tofcapture.poses import Float64
+from tofcapture.poses import Float64, invert_all
 
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 LONG = {"mm": "millimetres", "cm": "centimetres", "in": "inches", "m": "metres"}
@@ -203,7 +210,7 @@ def _by_angles(hand: Readings, target: Readings) -> list[tuple[str, str]]:
     """Readings of both sides whose angles between the pairs agree best, best first; the usual one is always among them."""
     turns = [np.stack([_angles(side.rotations(n)) for n in side.names]) for side in (hand, target)]
     mismatch = np.stack([np.median(np.abs(turns[1] - one), axis=1) for one in turns[0]])
-    limit = max(CLOSE * float(mismatch.min()) + CLOSE_RAD, 0)
+    limit = CLOSE * float(mismatch.min()) + CLOSE_RAD
     order = np.stack(np.unravel_index(np.argsort(mismatch, axis=None, kind="stable"), mismatch.shape), axis=1)
     close = [(hand.names[i], target.names[j]) for i, j in order if mismatch[i, j] <= limit]
     # Programs write both sides alike, or in their usual form: of readings that turn equally these are looked at first.
@@ -338,7 +345,7 @@ def _name(name: str) -> str:
 def _said(readings: Readings, name: str, unit: str) -> str:
     plain = name in {"xyzw", "matrix"} or (name == "rotvec rad" and readings.told)
     words = [] if plain else [_name(name)]
-    words += [LONG[unit]] if unit != "m" and (not readings.unit or unit != "m") else []
+    words += [LONG[unit]] if unit != "m" else []
     words += ["inverted, as was told"] if readings.inverted else []
     words += readings.notes
     return ", ".join(words)

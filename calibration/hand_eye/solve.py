@@ -16,8 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.hand_eye.checks import Cause, check_motion, check_numbers, check_pairing, clean
-from calibration.hand_eye.closed_form import SCALE, distances, nearest_rotation, park_martin, rotation_bound
-from calibration.hand_eye.diagnosis import check_agreement, oriented, scaled, scaled_consensus
+from calibration.hand_eye.closed_form import (
+    SCALE,
+    distances,
+    nearest_rotation,
+    park_martin,
+    rotation_bound,
+    scaled,
+    scaled_consensus,
+)
+from calibration.hand_eye.diagnosis import check_agreement, oriented
 from calibration.hand_eye.refine import Refined, refine
 from tofcapture.poses import Float64, exp, invert, log, transform
 

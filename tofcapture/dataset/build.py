@@ -84,6 +84,11 @@ def build_dataset(
 ) -> BuildResult:
     """Build or complete a dataset.
 
+    Returns the outcome: a scene with a damaged view is a failure there; the others are built.
+
+    Raises :class:`ConfigError`: no rig, a scene that is in two recordings, a part that is none, or an engine
+    that is not there; :class:`DataError`: no scenes.
+
     Parameters
     ----------
     recordings
@@ -106,18 +111,6 @@ def build_dataset(
         ``(2, 8)``: build the second eighth of the scenes only. The call that finds all shards in place finishes the dataset.
     finish
         Build nothing, finish the dataset from the shards that are there.
-
-    Returns
-    -------
-    BuildResult
-        A scene with a damaged view is a failure there; the others are built.
-
-    Raises
-    ------
-    ConfigError
-        No rig, a scene that is in two recordings, a part that is none, or an engine that is not there.
-    DataError
-        No scenes.
     """
     config, out = config or SampleConfig(), Path(out)
     index, count = part or (1, 1)
@@ -166,12 +159,8 @@ def scene_tasks(
 def find_scenes(recordings: Sequence[Path]) -> dict[str, tuple[Path, tuple[Path, ...]]]:
     """Find the view files by scene: ``(recording, views in order)``, without the board's.
 
-    Raises
-    ------
-    DataError
-        A recording does not exist or holds no scene.
-    ConfigError
-        Two recordings hold the same scene.
+    Raises :class:`DataError`: a recording does not exist or holds no scene; :class:`ConfigError`: two
+    recordings hold the same scene.
     """
     found: dict[str, tuple[Path, tuple[Path, ...]]] = {}
     for recording in recordings:

@@ -156,11 +156,9 @@ def _of_first(dataset: Path, manifest: Manifest) -> dict[str, Any]:
 def croissant(dataset: Path, manifest: Manifest) -> dict[str, Any]:
     """Describe a dataset whose manifest is written.
 
-    Returns
-    -------
-    JSON-LD: the manifest and every shard as file objects with their SHA-256, the splits and their scenes as a record set. What
-    the data do not tell (licence, authors, citation) is left out, never invented. Croissant has no reader for HDF5, so arrays
-    are not fields; ``docs/formats.md`` describes them.
+    Returns JSON-LD: the manifest and every shard as file objects with their SHA-256, the splits and their
+    scenes as a record set. What the data do not tell (licence, authors, citation) is left out, never
+    invented. Croissant has no reader for HDF5, so arrays are not fields; ``docs/formats.md`` describes them.
     """
     about = "Raw time-of-flight phase images with stereo ground truth"
     first = manifest.scenes[min(manifest.scenes)]

@@ -33,6 +33,8 @@ SPARSE = 4  # pixels between points that vote for the table
 class SampleConfig:
     """Choose what a sample depends on besides the view and the rig.
 
+    Raises :class:`ConfigError`: for other scales.
+
     Attributes
     ----------
     crop_radius
@@ -42,11 +44,6 @@ class SampleConfig:
         Largest depth of ground truth in the ToF frame, metres.
     scales
         Of the ToF image's resolution, that ground truth is made at: 1 and 2, or 1, 2 and 4.
-
-    Raises
-    ------
-    ConfigError
-        For other scales.
     """
 
     crop_radius: float = 0.35
@@ -73,6 +70,8 @@ def make_sample(
 ) -> Sample:
     """Make one sample: the paper's pre-processing, section III.
 
+    Raises :class:`DataError`: the view and the rig are of different cameras.
+
     Parameters
     ----------
     view
@@ -87,11 +86,6 @@ def make_sample(
         Of the ToF camera: :func:`decoder_for`.
     depth
         (SH, SW) z of the view's point map, for a view that was read without it.
-
-    Raises
-    ------
-    DataError
-        The view and the rig are of different cameras.
     """
     check_cameras(view, rig)
     T_base_tof = view.arm_before.T_base_flange @ rig.T_flange_tof

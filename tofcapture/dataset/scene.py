@@ -161,22 +161,17 @@ def build_shard(
 ) -> str:
     """Make one shard, whole or not at all.
 
+    Returns the SHA-256 of the shard.
+
+    Raises :class:`DataError`: a view is damaged or is of another camera than the rig, or stereo measured
+    nothing in the ToF camera's image in any view; nothing is left behind.
+
     Parameters
     ----------
     task, pool, progress
         As for :func:`build_scene`.
     inputs
         SHA-256 of each view file.
-
-    Returns
-    -------
-    SHA-256 of the shard.
-
-    Raises
-    ------
-    DataError
-        A view is damaged or is of another camera than the rig, or stereo measured nothing in the ToF camera's image in any view;
-        nothing is left behind.
     """
     first, _ = read_depth_view(task.views[0])
     decoder = decoder_for(first, task.rig)

@@ -158,10 +158,7 @@ def dataset_stats(
 ) -> DatasetStats:
     """Count a dataset in one pass over its shards; ``progress`` is told views done and views in all.
 
-    Raises
-    ------
-    DataError
-        The manifest or a shard is missing or damaged.
+    Raises :class:`DataError`: the manifest or a shard is missing or damaged.
     """
     manifest = load_manifest(dataset)
     splits = {name: SplitStats() for name in SPLITS if manifest.split(name)}

@@ -33,30 +33,21 @@ class Device(Protocol):
     def probe(self) -> str:
         """Tell whether the device is there, without opening or disturbing it.
 
-        Returns
-        -------
-        str
-            What was found; empty when the device cannot be asked.
+        Returns what was found, empty when the device cannot be asked.
 
-        Raises
-        ------
-        DeviceError
-            It is not there, or not ready.
+        Raises :class:`DeviceError`: it is not there, or not ready.
         """
         return ""
 
     def watch(self, silence: float) -> None:
         """Look after the open device; a driver host calls this a few times a second from another thread.
 
+        Raises :class:`ArmFault`: something is wrong: the host then reports this, and ends the driver.
+
         Parameters
         ----------
         silence
             Seconds since the station's process gave a sign of life.
-
-        Raises
-        ------
-        ArmFault
-            Something is wrong: the host then reports this, and ends the driver.
         """
         del silence
 
@@ -76,10 +67,8 @@ class Arm(Device, Protocol):
     def kinematics(self) -> ArmModel:
         """Give the arm's geometry, without opening it; here that of a known ``model``.
 
-        Raises
-        ------
-        ConfigError
-            It is not known: a table ``[arm.kinematics]`` of the station must give it.
+        Raises :class:`ConfigError`: it is not known: a table ``[arm.kinematics]`` of the station must give
+        it.
         """
         from tofcapture.devices.kinematics import arm_model
 
@@ -90,10 +79,7 @@ class Arm(Device, Protocol):
 
         Plans are made, and dry runs proved, with it. An arm that takes any motion leaves it out.
 
-        Raises
-        ------
-        MotionRefused
-            ``move_to(goal)`` would refuse, were the arm at ``start``.
+        Raises :class:`MotionRefused`: ``move_to(goal)`` would refuse, were the arm at ``start``.
         """
         del start, goal
 
@@ -112,10 +98,7 @@ class Arm(Device, Protocol):
     def move_to(self, joints: Float64) -> ArmState:
         """Move to joint angles (6,) in radians, wait until settled, return the measured state.
 
-        Raises
-        ------
-        MotionRefused
-            The goal is outside the limits or the arm refuses.
+        Raises :class:`MotionRefused`: the goal is outside the limits or the arm refuses.
         """
         ...
 
@@ -179,17 +162,14 @@ class Operator(Device, Protocol):
     def turn(self, scene: str, angle: float) -> None:
         """Return when the scene is turned about the vertical.
 
+        Raises :class:`DeviceError`: nobody can turn it.
+
         Parameters
         ----------
         scene
             Its name.
         angle
             From how it stood first, counter-clockwise seen from above, radians.
-
-        Raises
-        ------
-        DeviceError
-            Nobody can turn it.
         """
         raise DeviceError(f"nobody can turn {scene!r} by {angle:.2f} rad", hint="record without --turns")
 

@@ -81,17 +81,11 @@ class Arducam(ReopenedCamera, TofCamera):
     def capture(self, frames: int) -> TofBurst:
         """Take so many new frames.
 
-        Returns
-        -------
-        Burst with the host's monotonic time at which each frame was handed over, which is after its exposure, and NaN
-        temperatures: the SDK gives neither.
+        Returns the burst with the host's monotonic time at which each frame was handed over, which is after its
+        exposure, and NaN temperatures: the SDK gives neither.
 
-        Raises
-        ------
-        ConfigError
-            Fewer than one frame.
-        DeviceError
-            Frames do not come, or are no stack of phase images; the next call opens the camera anew.
+        Raises :class:`ConfigError`: fewer than one frame; :class:`DeviceError`: frames do not come, or are no
+        stack of phase images; the next call opens the camera anew.
         """
         if frames < 1:
             raise ConfigError(f"frames: expected at least 1, got {frames}")
@@ -137,10 +131,7 @@ class Arducam(ReopenedCamera, TofCamera):
 def _phases(frame: Any, info: TofInfo) -> NDArray[np.uint16]:
     """Copy a frame's phase images (K, H, W) out of the SDK's memory.
 
-    Raises
-    ------
-    DeviceError
-        It is no RAW frame, or not a stack of K images of H x W.
+    Raises :class:`DeviceError`: it is no RAW frame, or not a stack of K images of H x W.
     """
     data = getattr(frame, "raw_data", None)
     if data is None:

@@ -46,10 +46,7 @@ class ConsoleOperator(Operator):
     def place(self, scene: str) -> None:
         """Ask for a scene and wait until it stands; asks once for each change.
 
-        Raises
-        ------
-        DeviceError
-            Nobody can answer: the input is not a terminal, or has ended.
+        Raises :class:`DeviceError`: nobody can answer: the input is not a terminal, or has ended.
         """
         if scene == self._placed:
             return

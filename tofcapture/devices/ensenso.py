@@ -84,14 +84,9 @@ class Ensenso(ReopenedCamera, StereoDevice):
 
         A capture that times out is tried once more as it is, then once after closing and opening the camera.
 
-        Returns
-        -------
-        Frame with ``time_ns`` in the middle of the exposures, host's monotonic clock.
+        Returns the frame with ``time_ns`` in the middle of the exposures, host's monotonic clock.
 
-        Raises
-        ------
-        DeviceError
-            The camera does not deliver; the next call opens it anew.
+        Raises :class:`DeviceError`: the camera does not deliver; the next call opens it anew.
         """
         with suppress(CaptureTimeoutError), self.opened():
             try:
@@ -153,10 +148,7 @@ def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
 def metres(points_mm: NDArray[np.float32], shape: tuple[int, int], serial: str) -> NDArray[np.float32]:
     """Turn a point map (H, W, 3) float32 into metres; all three coordinates become NaN where any is not finite.
 
-    Raises
-    ------
-    DeviceError
-        Another shape than ``shape`` (H, W), another type; or not one point.
+    Raises :class:`DeviceError`: another shape than ``shape`` (H, W), another type; or not one point.
     """
     if points_mm.shape != (*shape, 3) or points_mm.dtype != np.float32:
         raise DeviceError(
@@ -181,12 +173,8 @@ def metres(points_mm: NDArray[np.float32], shape: tuple[int, int], serial: str) 
 def library(path: str | None) -> Iterator[None]:
     """Load and initialise the SDK; finalise it on leaving.
 
-    Raises
-    ------
-    ConfigError
-        The Python package or the SDK's shared library is missing.
-    DeviceError
-        The SDK does not initialise.
+    Raises :class:`ConfigError`: the Python package or the SDK's shared library is missing;
+    :class:`DeviceError`: the SDK does not initialise.
     """
     try:
         from nxlib import api

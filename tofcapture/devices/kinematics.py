@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofcapture.errors import ConfigError, MotionRefused
-from tofcapture.poses import Float64, rotation_angle
+from tofcapture.poses import Float64, invert_all, rotation_angle
 
 _ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 _EDGE = 1e-10  # how far a cosine may stand outside [-1, 1] by rounding, at the border of the workspace
@@ -169,10 +169,7 @@ def arm_model(name: str) -> ArmModel:
 def check_joints(model: ArmModel, joints: ArrayLike) -> Float64:
     """Check a goal (6,) in radians; returns a copy, float64.
 
-    Raises
-    ------
-    MotionRefused
-        Not six finite angles, or one beyond the model's limit.
+    Raises :class:`MotionRefused`: not six finite angles, or one beyond the model's limit.
     """
     goal = np.array(joints, dtype=np.float64)
     if goal.shape != (6,) or not np.isfinite(goal).all():
@@ -190,7 +187,7 @@ def pose_error(model: ArmModel, joints: ArrayLike, T_base_flange: ArrayLike) -> 
 
     Calibrated arms differ from nominal ones by 1 to 2 mm.
     """
-    off = _inverses(forward(model, joints)) @ np.asarray(T_base_flange, dtype=np.float64)
+    off = invert_all(forward(model, joints)) @ np.asarray(T_base_flange, dtype=np.float64)
     shift, turn = float(np.linalg.norm(off[:3, 3])), rotation_angle(off[:3, :3])
     if shift <= _MODEL_ERROR[0] and turn <= _MODEL_ERROR[1]:
         return ""
@@ -267,11 +264,10 @@ def _elbow(ur: Offsets, T_1_4: Float64) -> tuple[Float64, Float64, Float64]:
 def inverse_all(model: ArmModel, T_base_flange: ArrayLike, near: ArrayLike = HOME) -> Float64:
     """Branches of the inverse kinematics of many poses (..., 4, 4), metres.
 
-    Returns
-    -------
-    (..., S, 6) float64 radians in [-pi, pi]; NaN rows where a branch cannot reach. For a UR the 8 of the closed form: shoulder
-    left/right x wrist flip x elbow; at the wrist singularity (q5 = 0 or pi) q6 is set to zero and both wrist branches
-    coincide. For any other arm what is found from starts ``near`` (6,) and elsewhere: maybe not all there are.
+    Returns (..., S, 6) float64 radians in [-pi, pi]; NaN rows where a branch cannot reach. For a UR the 8 of
+    the closed form: shoulder left/right x wrist flip x elbow; at the wrist singularity (q5 = 0 or pi) q6 is
+    set to zero and both wrist branches coincide. For any other arm what is found from starts ``near`` (6,)
+    and elsewhere: maybe not all there are.
     """
     T = np.asarray(T_base_flange, dtype=np.float64)
     if model.closed is None:
@@ -283,7 +279,7 @@ def inverse_all(model: ArmModel, T_base_flange: ArrayLike, near: ArrayLike = HOM
     q1 = np.broadcast_to(q1[..., None], q5.shape)
     turned = [_link(np.zeros(3), q) for q in (q1, q5, q6)]
     tail = turned[1] @ model.fixed[5] @ turned[2] @ model.fixed[6]
-    q2, q3, q4 = _elbow(model.closed, _inverses(turned[0] @ model.fixed[1]) @ T2 @ _inverses(tail))
+    q2, q3, q4 = _elbow(model.closed, invert_all(turned[0] @ model.fixed[1]) @ T2 @ invert_all(tail))
     columns = [np.broadcast_to(q[..., None], q3.shape) for q in (q1, q5, q6)]
     q = np.stack([columns[0], q2, q3, q4, columns[1], columns[2]], axis=-1)
     q = wrap(q).reshape(*T.shape[:-2], 8, 6)
@@ -328,13 +324,3 @@ def _pose_error(now: Float64, goal: Float64) -> Float64:
     cosine = (np.trace(R, axis1=1, axis2=2) - 1) / 2
     turn = skew / np.sqrt(np.maximum(2 + 2 * cosine, 1e-3))[:, None]
     return np.concatenate([goal[:, :3, 3] - now[:, :3, 3], turn], axis=1)
-
-
-def _inverses(T: Float64) -> Float64:
-    """Invert rigid transforms (..., 4, 4)."""
-    out = np.zeros_like(T)
-    rotation = np.swapaxes(T[..., :3, :3], -1, -2)
-    out[..., :3, :3] = rotation
-    out[..., :3, 3] = -(rotation @ T[..., :3, 3:])[..., 0]
-    out[..., 3, 3] = 1.0
-    return out

@@ -59,10 +59,7 @@ def found_drivers() -> dict[str, EntryPoint]:
 def load_driver(name: str) -> Mapping[str, Factory]:
     """Import a driver; returns role -> factory.
 
-    Raises
-    ------
-    ConfigError
-        No such driver, or it does not import, or it is not a mapping of known roles.
+    Raises :class:`ConfigError`: no such driver, or it does not import, or it is not a mapping of known roles.
     """
     found = found_drivers()
     if name not in found:
@@ -86,10 +83,8 @@ def load_driver(name: str) -> Mapping[str, Factory]:
 def make_device(role: str, context: StationContext) -> Any:
     """Make the device that the station's table ``[role]`` names, without opening it.
 
-    Raises
-    ------
-    ConfigError
-        The table is missing or names no driver, the driver is unknown, does not do this role, or lacks a method of it.
+    Raises :class:`ConfigError`: the table is missing or names no driver, the driver is unknown, does not do
+    this role, or lacks a method of it.
     """
     table = context.config.get(role)
     if not isinstance(table, Mapping) or not isinstance(table.get("driver"), str):

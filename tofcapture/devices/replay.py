@@ -201,12 +201,8 @@ class ReplayArm(_Replayed, Arm):
     def move_to(self, joints: Float64) -> ArmState:
         """Go to the view recorded there (or the next by number), at once.
 
-        Raises
-        ------
-        MotionRefused
-            Not six finite angles within the arm's limits.
-        DeviceError
-            By number, and there is no further view.
+        Raises :class:`MotionRefused`: not six finite angles within the arm's limits; :class:`DeviceError`: by
+        number, and there is no further view.
         """
         self._latch.check(self._latch.token)
         self._between = check_joints(self._model(), joints)
@@ -235,10 +231,7 @@ class ReplayTof(_Replayed, TofCamera):
     def capture(self, frames: int) -> TofBurst:
         """Give the first ``frames`` frames of the recorded burst.
 
-        Raises
-        ------
-        DeviceError
-            No view is here, or its burst is shorter.
+        Raises :class:`DeviceError`: no view is here, or its burst is shorter.
         """
         burst = self._replay.view().tof
         if not 1 <= frames <= len(burst.raw):

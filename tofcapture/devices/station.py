@@ -71,10 +71,7 @@ class Station:
 def read_station(path: Path | None, seed: int | None = None) -> dict[str, Any]:
     """Read ``station.toml``, or the embedded simulated station, and check its tables; ``seed`` replaces ``[sim] seed``.
 
-    Raises
-    ------
-    ConfigError
-        Unreadable, not TOML, unknown or misplaced tables.
+    Raises :class:`ConfigError`: unreadable, not TOML, unknown or misplaced tables.
     """
     where = path or DEFAULT
     try:
@@ -103,6 +100,9 @@ def open_station(
 ) -> Iterator[Station]:
     """Open every device of a station; on leaving, stop the arm after an error, and close all in reverse order.
 
+    Raises :class:`ConfigError`: the file is wrong; :class:`DeviceError`: devices do not open; the message
+    names all of them.
+
     Parameters
     ----------
     path
@@ -111,13 +111,6 @@ def open_station(
         Replaces ``[sim] seed``.
     allow_motion
         Let a real arm move. Without it ``station.arm`` refuses every ``move_to``; simulated arms always move.
-
-    Raises
-    ------
-    ConfigError
-        The file is wrong.
-    DeviceError
-        Devices do not open; the message names all of them.
     """
     config = read_station(path, seed)
     folder = (path or DEFAULT).resolve().parent

@@ -18,12 +18,8 @@ def urdf_model(path: Path, base: str, tip: str, radius: float, **limits: Float64
 
     Meshes are not looked at: links are ``radius`` metres thick. ``low`` and ``high`` (6,) rad replace the file's joint limits.
 
-    Raises
-    ------
-    ConfigError
-        Not readable, no URDF, no such link, or other than six joints that turn between them.
-    ValueError
-        Words where numbers should be.
+    Raises :class:`ConfigError`: not readable, no URDF, no such link, or other than six joints that turn
+    between them; :class:`ValueError`: words where numbers should be.
     """
     try:
         root = ET.parse(path).getroot()  # noqa: S314  a file of the user's own station

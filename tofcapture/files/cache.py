@@ -134,6 +134,11 @@ class PackedScene:
 def pack(dataset: Path, split: str, out: Path, progress: Progress | None = None) -> dict[str, PackedScene]:
     """Pack a split, or complete a cache that was begun.
 
+    Returns the scenes, as :func:`open_cache` gives them.
+
+    Raises :class:`DataError`: the split is empty, or a shard is missing or damaged: its digest is checked
+    before it is packed; :class:`FormatError`: ``out`` is a cache of another split.
+
     Parameters
     ----------
     dataset
@@ -144,17 +149,6 @@ def pack(dataset: Path, split: str, out: Path, progress: Progress | None = None)
         The cache's folder; scenes in it that are as the manifest says are kept, others are written anew.
     progress
         Told after each view.
-
-    Returns
-    -------
-    The scenes, as :func:`open_cache` gives them.
-
-    Raises
-    ------
-    DataError
-        The split is empty, or a shard is missing or damaged: its digest is checked before it is packed.
-    FormatError
-        ``out`` is a cache of another split.
     """
     dataset, out = Path(dataset), Path(out)
     entries = load_manifest(dataset).split(split) if split in SPLITS else {}

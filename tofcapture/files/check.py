@@ -34,16 +34,14 @@ _OWN = ("manifest.json", "croissant.json", "shards", "simulation", "stats.html",
 def check(path: Path, progress: Tell | None = None) -> list[Problem]:
     """List every problem.
 
+    Returns nothing when everything is as it should be. Whatever the data, this does not raise.
+
     Parameters
     ----------
     path
         A view file, a shard, the folder of a recording, a dataset or a cache.
     progress
         Told each file before it is read.
-
-    Returns
-    -------
-    Empty when everything is as it should be. Whatever the data, this does not raise.
     """
     path, tell = Path(path), progress or (lambda _: None)
     if path.is_dir():

@@ -162,6 +162,9 @@ class ShardReader:
     A reader in use may cross a fork: HDF5 reads by position, so that processes share no offset. It is a sequence of the scene's
     views, each a :class:`Sample`. Views and frames are counted from the end where they are negative.
 
+    Raises :class:`DataError`, :class:`FormatError`: on first use: a file that is missing, damaged, foreign or
+    of another version.
+
     Parameters
     ----------
     path
@@ -169,11 +172,6 @@ class ShardReader:
     sha256
         Its digest in the manifest; ``None``: the one beside it counts, if there is one. On first use the whole file is hashed,
         once per process and for the processes that it hands readers to (docs/decisions/0016).
-
-    Raises
-    ------
-    DataError, FormatError
-        On first use: a file that is missing, damaged, foreign or of another version.
     """
 
     def __init__(self, path: Path | str, sha256: str | None = None) -> None:

@@ -155,25 +155,18 @@ def write_view(path: str | Path, view: View) -> str:
 
     Killed at any moment it leaves either no file of that name or a whole one. The same view gives the same bytes.
 
+    Returns the SHA-256 of the file, hexadecimal; also stored beside it.
+
+    Raises :class:`FormatError`: when an array has a shape or dtype that the layout does not allow;
+    :class:`DataError`: when what was read back is not what was written; :class:`OSError`: when the disk
+    refuses (full, read-only).
+
     Parameters
     ----------
     path
         Usually :func:`view_path`; folders are made, an older file of that name is replaced.
     view
         What to write.
-
-    Returns
-    -------
-    SHA-256 of the file, hexadecimal; also stored beside it.
-
-    Raises
-    ------
-    FormatError
-        When an array has a shape or dtype that the layout does not allow.
-    DataError
-        When what was read back is not what was written.
-    OSError
-        When the disk refuses (full, read-only).
     """
     path = Path(path)
     check_scene_name(view.scene)
@@ -215,12 +208,9 @@ def _write(file: h5py.File, view: View, arrays: dict[str, Array]) -> None:
 def open_view(path: str | Path) -> View:
     """Read a view back, bit by bit what was written.
 
-    Raises
-    ------
-    DataError
-        Missing, truncated, not HDF5, or damaged data; the message names the file and the dataset.
-    FormatError
-        Another format or version, a dataset missing, or shapes that contradict each other.
+    Raises :class:`DataError`: missing, truncated, not HDF5, or damaged data; the message names the file and
+    the dataset; :class:`FormatError`: another format or version, a dataset missing, or shapes that contradict
+    each other.
     """
     path = Path(path)
     with _opened(path) as file:

@@ -173,10 +173,7 @@ def prove(station: Station, plan: Plan) -> list[list[Float64]]:
 
     Returns the goals (6,) of each view's way, and of the way home after the last one.
 
-    Raises
-    ------
-    MotionRefused
-        A leg is refused; the message names its view.
+    Raises :class:`MotionRefused`: a leg is refused; the message names its view.
     """
     workcell, model, here = workcell_of(station.config), station.arm.kinematics(), station.arm.state().joints
     ways = []

@@ -68,6 +68,12 @@ def record(
     It can be killed at any moment and run again: views that are sealed stay, the others are taken. On the simulated station
     the arrays are those of a run that was never killed.
 
+    Raises :class:`ConfigError`: the recording was begun with other cameras, frames or poses, the operator cannot turn objects,
+    there is no such view, a driver breaks its promises, or a folder is another one now; :class:`DiskFull`; :class:`BusyError`:
+    another recorder works on this recording, or moves this arm; :class:`DeviceError`: two views in a row failed three times each,
+    or the last one for the first time, or a device needs a person; :class:`Stopped`: the observer, ``tofcapture stop``, or a stop
+    of the arm.
+
     Parameters
     ----------
     station, scene, recording
@@ -81,12 +87,6 @@ def record(
         Looks on; may make the recorder wait between views, or end it.
     retake
         Number of a view to take again, and no other. The one before is set aside when the new one is there.
-
-    Raises :class:`ConfigError`: the recording was begun with other cameras, frames or poses, the operator cannot turn objects,
-    there is no such view, a driver breaks its promises, or a folder is another one now; :class:`DiskFull`; :class:`BusyError`:
-    another recorder works on this recording, or moves this arm; :class:`DeviceError`: two views in a row failed three times each,
-    or the last one for the first time, or a device needs a person; :class:`Stopped`: the observer, ``tofcapture stop``, or a stop
-    of the arm.
     """
     if station is None or isinstance(station, str | Path):
         with open_station(None if station is None else Path(station)) as opened:

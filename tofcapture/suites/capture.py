@@ -67,9 +67,8 @@ def take_views(job: Job, recording: Path) -> Counter[str]:
 
     They go into ``recording`` as ``views/<scene>/view-007.h5``; whole views in it are kept.
 
-    Returns
-    -------
-    CPU seconds by stage (``scene``, ``poses``, ``light``, ``tof``, ``stereo``, ``truth``, ``write``), and ``views`` taken.
+    Returns CPU seconds by stage (``scene``, ``poses``, ``light``, ``tof``, ``stereo``, ``truth``, ``write``),
+    and ``views`` taken.
     """
     spent: Counter[str] = Counter()
     last = time.process_time()

@@ -26,12 +26,8 @@ _HINT = "give a recording, view-000.h5, a shard, a dataset, a folder of predict,
 def open_source(path: Path) -> Source:
     """Open a recording, view file, dataset, shard, prediction, ``rig.toml`` or ``evidence.json``.
 
-    Raises
-    ------
-    DataError
-        Nothing is there, or nothing that can be shown.
-    FormatError
-        A file is not what its name or header promises.
+    Raises :class:`DataError`: nothing is there, or nothing that can be shown; :class:`FormatError`: a file is
+    not what its name or header promises.
     """
     if not path.exists():
         raise DataError(f"{path}: no such file or folder", hint=_HINT)

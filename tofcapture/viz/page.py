@@ -94,10 +94,7 @@ def mask_legend(mask: NDArray[np.uint8]) -> list[tuple[str, str, str]]:
 def write_page(template: Path, out: Path, content: Mapping[str, Any]) -> Path:
     """Write a page whose template extends ``base.html.j2``; everything but SVG is escaped. Same content, same bytes.
 
-    Raises
-    ------
-    ConfigError
-        jinja2 is missing.
+    Raises :class:`ConfigError`: jinja2 is missing.
     """
     try:
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -144,10 +141,7 @@ _FRUSTUM = 0.08  # m, length of a camera's drawing
 def canvas(ink: str = "black") -> Iterator[Any]:
     """Give an empty figure; nobody's matplotlibrc and no random mark of an SVG change its bytes.
 
-    Raises
-    ------
-    ConfigError
-        matplotlib is missing.
+    Raises :class:`ConfigError`: matplotlib is missing.
     """
     try:
         import matplotlib as mpl

@@ -36,10 +36,7 @@ def write_rrd(source: Source, path: Path, most: int, progress: Callable[[int, in
 
     ``progress`` is told how many shots of how many are written.
 
-    Raises
-    ------
-    ConfigError
-        Rerun is not installed.
+    Raises :class:`ConfigError`: Rerun is not installed.
     """
     rr = _load_rerun()
     picked = source.spread(most)

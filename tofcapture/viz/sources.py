@@ -29,10 +29,7 @@ _FAR = 3.0  # m; what lies beyond is floor and walls
 def recording_source(recording: Path) -> Source:
     """Shots of every view of a recording; ``rig.toml`` in it is used where ``align`` has written one.
 
-    Raises
-    ------
-    DataError
-        It holds no view.
+    Raises :class:`DataError`: it holds no view.
     """
     paths = [path for views in scenes_of(recording).values() for path in views]
     rig, arm = rig_of(recording, paths[0]), arm_of(recording)
@@ -53,10 +50,7 @@ def view_source(path: Path) -> Source:
 def scenes_of(recording: Path) -> dict[str, list[Path]]:
     """View files of a recording by scene.
 
-    Raises
-    ------
-    DataError
-        It is no recording, or holds no view.
+    Raises :class:`DataError`: it is no recording, or holds no view.
     """
     if not recording.exists():
         raise DataError(
@@ -74,10 +68,7 @@ def scenes_of(recording: Path) -> dict[str, list[Path]]:
 def scene_views(recording: Path, scene: str | None = None) -> list[Path]:
     """View files of one scene in order; ``None``: of the first one that is not the board.
 
-    Raises
-    ------
-    DataError
-        It is no recording, or has no such scene.
+    Raises :class:`DataError`: it is no recording, or has no such scene.
     """
     found = scenes_of(recording)
     if scene is not None and scene not in found:
@@ -89,10 +80,7 @@ def scene_views(recording: Path, scene: str | None = None) -> list[Path]:
 def pick_view(path: Path, scene: str | None, view: int | None) -> Path:
     """Find one view file: ``path`` itself, or the named view of a recording's scene; ``None``: the first.
 
-    Raises
-    ------
-    DataError
-        There is no such view.
+    Raises :class:`DataError`: there is no such view.
     """
     if path.is_file():
         return path
@@ -166,10 +154,7 @@ def shard_source(path: Path) -> Source:
 def dataset_source(dataset: Path) -> Source:
     """Shots of every view of every shard that the manifest names.
 
-    Raises
-    ------
-    DataError
-        The manifest, or a shard, is missing or damaged.
+    Raises :class:`DataError`: the manifest, or a shard, is missing or damaged.
     """
     entries = load_manifest(dataset).scenes
     return _shards(f"dataset {dataset.name}", [dataset / entries[name].path for name in sorted(entries)])
@@ -211,10 +196,7 @@ def shard_shot(path: Path, view: int) -> Shot:
 def prediction_source(folder: Path) -> Source:
     """The one shot of a folder that ``predict`` wrote.
 
-    Raises
-    ------
-    DataError
-        A file of it is missing or damaged.
+    Raises :class:`DataError`: a file of it is missing or damaged.
     """
     depth, normals = read_maps(folder)
     try:
@@ -235,10 +217,7 @@ def prediction_source(folder: Path) -> Source:
 def read_maps(folder: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     """Depth (H, W) in metres and normals (H, W, 3) that ``predict`` wrote.
 
-    Raises
-    ------
-    DataError
-        A file is missing or damaged.
+    Raises :class:`DataError`: a file is missing or damaged.
     """
     try:
         depth, normals = (np.load(folder / f"{n}.npy", allow_pickle=False) for n in ("depth", "normals"))

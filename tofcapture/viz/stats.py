@@ -32,12 +32,8 @@ TABLES = {
 def write_stats_page(stats: DatasetStats, path: Path) -> Path:
     """Write the page atomically.
 
-    Raises
-    ------
-    ConfigError
-        jinja2 or matplotlib is missing.
-    DataError
-        A shard that is shown is missing or damaged.
+    Raises :class:`ConfigError`: jinja2 or matplotlib is missing; :class:`DataError`: a shard that is shown is
+    missing or damaged.
     """
     content = {
         "name": stats.dataset.resolve().name,

@@ -149,10 +149,7 @@ class _Page(SimpleHTTPRequestHandler):
 def page_server(rrd: Path, port: int = PORT) -> Iterator[ThreadingHTTPServer]:
     """Give a server of the page of a file on the loopback interface; another port is taken where the wanted one is not free.
 
-    Raises
-    ------
-    ConfigError
-        Rerun is not installed.
+    Raises :class:`ConfigError`: Rerun is not installed.
     """
     with tempfile.TemporaryDirectory(prefix="tofcapture-view-") as folder:
         save_page(Path(folder))

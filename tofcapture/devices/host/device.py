@@ -98,12 +98,8 @@ class HostedDevice(Device):
     def call(self, verb: str, *args: Any) -> Any:
         """Call a method of the driver, one at a time.
 
-        Raises
-        ------
-        ArmFault
-            The child was lost or reported a state that needs a person; the same again until opened anew.
-        TofError
-            What the driver raised.
+        Raises :class:`ArmFault`: the child was lost or reported a state that needs a person; the same again
+        until opened anew; :class:`TofError`: what the driver raised.
         """
         with self._one:
             return self._called(verb, *args)
@@ -241,6 +237,8 @@ def hosted(
 ) -> Callable[[Mapping[str, Any], StationContext], Any]:
     """Make a factory, for ``DRIVERS``, of a driver that lives in a child process.
 
+    Raises :class:`ConfigError`: another role.
+
     Parameters
     ----------
     role
@@ -251,11 +249,6 @@ def hosted(
         Seconds by verb, where the usual ones do not fit.
     overdue
         What it means for this device when a call exceeds its deadline.
-
-    Raises
-    ------
-    ConfigError
-        Another role.
     """
     if role not in _KINDS:
         raise ConfigError(f"hosted driver: expected a role of {', '.join(_KINDS)}, got {role!r}")

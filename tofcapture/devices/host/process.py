@@ -83,12 +83,8 @@ class Host:
 
         With ``quiet`` the call may hold Python's lock, so that signs of life do not count while it runs.
 
-        Raises
-        ------
-        HostLost
-            The child died, fell silent, or took longer.
-        TofError
-            What the driver raised.
+        Raises :class:`HostLost`: the child died, fell silent, or took longer; :class:`TofError`: what the
+        driver raised.
         """
         if self.lost is not None:
             raise self.lost

@@ -55,6 +55,9 @@ def to_host(near: Anchor, rate: float, module_us: int) -> int:
 def burst_times(anchors: Sequence[Anchor], clocks_us: Sequence[int], period_us: int) -> NDArray[np.int64]:
     """Host times (ns) of a burst's exposures.
 
+    Raises :class:`ClockError`: the clock drifts as no crystal's does, or the times do not lie in order within
+    the burst.
+
     Parameters
     ----------
     anchors
@@ -63,11 +66,6 @@ def burst_times(anchors: Sequence[Anchor], clocks_us: Sequence[int], period_us: 
         Module clock at the start of each frame.
     period_us
         From one frame's start to the next.
-
-    Raises
-    ------
-    ClockError
-        The clock drifts as no crystal's does, or the times do not lie in order within the burst.
     """
     first, before, after = anchors
     rate = drift(first, after)

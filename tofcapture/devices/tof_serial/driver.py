@@ -97,16 +97,13 @@ class SerialTof(ReopenedCamera, TofCamera):
     def capture(self, frames: int) -> TofBurst:
         """Expose a burst into the module's memory, then upload it.
 
-        Returns
-        -------
-        Burst with the host's monotonic time of each frame's start of exposure, from the synchronised clock.
+        Returns the burst with the host's monotonic time of each frame's start of exposure, from the synchronised
+        clock.
 
-        Raises
-        ------
-        ConfigError
-            More frames than the module's memory holds.
-        LinkLostError, ModuleSilentError, LinkTooBadError, ModuleResetError, FirmwareError, ModuleRefusedError, ClockError
-            See ``tof_serial.session``; the next call starts from scratch.
+        Raises :class:`ConfigError`: more frames than the module's memory holds; :class:`LinkLostError`,
+        :class:`ModuleSilentError`, :class:`LinkTooBadError`, :class:`ModuleResetError`,
+        :class:`FirmwareError`, :class:`ModuleRefusedError`, :class:`ClockError`: see ``tof_serial.session``;
+        the next call starts from scratch.
         """
         with self.opened():
             module = self._module

@@ -122,14 +122,9 @@ class Session:
     def request(self, kind: Kind, body: bytes, unpack: Callable[[bytes], T]) -> Script[tuple[int, int, T]]:
         """Ask until answered; returns (sent_ns, received_ns, answer).
 
-        Raises
-        ------
-        ModuleSilentError, LinkTooBadError
-            No answer: to nothing at all, or to this request among others.
-        FirmwareError
-            Answers come in another protocol.
-        ModuleRefusedError
-            The module says no.
+        Raises :class:`ModuleSilentError`, :class:`LinkTooBadError`: no answer: to nothing at all, or to this
+        request among others; :class:`FirmwareError`: answers come in another protocol;
+        :class:`ModuleRefusedError`: the module says no.
         """
         answer, before = _MATCH.get(kind, Kind.STATE), self.heard
         now = (yield _NOW).now
@@ -189,12 +184,8 @@ class Session:
     def expose(self, burst: int, frames: int, period_us: int) -> Script[None]:
         """Take a burst into the module's memory; returns when it is exposed and the rig may move.
 
-        Raises
-        ------
-        ModuleResetError
-            The module started anew meanwhile, or has forgotten the burst.
-        ModuleSilentError
-            The burst does not become ready.
+        Raises :class:`ModuleResetError`: the module started anew meanwhile, or has forgotten the burst;
+        :class:`ModuleSilentError`: the burst does not become ready.
         """
         body = Capture(burst, frames).pack()
         _, now, state = yield from self.request(Kind.CAPTURE, body, BurstState.unpack)
@@ -224,14 +215,8 @@ class Session:
     def frame(self, burst: int, index: int, size: int) -> Script[tuple[Frame, NDArray[np.uint8]]]:
         """Upload a frame of ``size`` bytes; missing chunks are asked for again, in smaller pieces where the link is bad.
 
-        Raises
-        ------
-        LinkTooBadError
-            It cannot be completed.
-        ModuleRefusedError
-            The module says that it has another size.
-        ModuleResetError
-            The module has forgotten the burst.
+        Raises :class:`LinkTooBadError`: it cannot be completed; :class:`ModuleRefusedError`: the module says
+        that it has another size; :class:`ModuleResetError`: the module has forgotten the burst.
         """
         _, _, meta = yield from self.request(Kind.META, FrameKey(burst, index).pack(), Frame.unpack)
         if meta.size != size:

@@ -68,12 +68,8 @@ class UrArm(Arm):
     def __enter__(self) -> Self:
         """Probe, connect, check that this is the arm it should be. Nothing moves.
 
-        Raises
-        ------
-        ArmFault
-            The named state in which the controller is.
-        ConfigError
-            The arm's pose is not that of the model, or the library is missing.
+        Raises :class:`ArmFault`: the named state in which the controller is; :class:`ConfigError`: the arm's
+        pose is not that of the model, or the library is missing.
         """
         self._latch, self._goal = StopLatch(), None
         self._controller = probe(self._settings)
@@ -140,14 +136,9 @@ class UrArm(Arm):
     def move_to(self, joints: Float64) -> ArmState:
         """Check the way, move, wait until settled.
 
-        Raises
-        ------
-        MotionRefused
-            Motion is not allowed, the goal or the way is refused, or somebody said stop (MotionStopped).
-        NotSettled
-            The arm does not come to rest.
-        ArmFault
-            The named state in which the arm is now.
+        Raises :class:`MotionRefused`: motion is not allowed, the goal or the way is refused, or somebody said
+        stop (MotionStopped); :class:`NotSettled`: the arm does not come to rest; :class:`ArmFault`: the named
+        state in which the arm is now.
         """
         token, link = self._latch.token, self._opened()
         start = link.fresh()

@@ -98,10 +98,7 @@ def _boxes(key: str, value: Any) -> Float64:
 def check_goal(settings: Settings, start: Float64, joints: ArrayLike) -> Float64:
     """Check that a goal (6,) is sane, and one step away from the measured joints ``start`` at most; radians.
 
-    Raises
-    ------
-    MotionRefused
-        With the joint and the limit.
+    Raises :class:`MotionRefused`: with the joint and the limit.
     """
     goal = check_joints(settings.model, joints)
     turn = np.degrees(np.abs(goal - start))
@@ -117,10 +114,8 @@ def check_goal(settings: Settings, start: Float64, joints: ArrayLike) -> Float64
 def check_way(settings: Settings, rig: Rig, workcell: Workcell, start: Float64, goal: Float64) -> None:
     """Go along the straight way in joint space and look for what is in the way.
 
-    Raises
-    ------
-    MotionRefused
-        Out of the workspace, into a keep-out, or against table, object, base or itself.
+    Raises :class:`MotionRefused`: out of the workspace, into a keep-out, or against table, object, base or
+    itself.
     """
     body = body_of(settings.model, rig, workcell, straight_way(start, goal, _STEP))
     if settings.workspace is not None:
@@ -160,14 +155,8 @@ def follow(link: Link, goal: Float64, seconds: float, check: Callable[[], None])
 
     Half as much again as the planned ``seconds`` and 2 s are granted, longer when the speed slider is low.
 
-    Raises
-    ------
-    MotionStopped
-        Somebody said stop.
-    ProgramStopped
-        The arm did not arrive in time.
-    ArmFault
-        What else went wrong.
+    Raises :class:`MotionStopped`: somebody said stop; :class:`ProgramStopped`: the arm did not arrive in
+    time; :class:`ArmFault`: what else went wrong.
     """
     patience, last, near = 1.5 * seconds + 2.0, time.monotonic(), 0
     while near < _READINGS:
@@ -188,12 +177,7 @@ def settle(link: Link, ringing: float, check: Callable[[], None]) -> Sample:
 
     ``check`` ends the wait by raising MotionStopped.
 
-    Raises
-    ------
-    NotSettled
-        Not at rest within 3 s.
-    ArmFault
-        What else went wrong.
+    Raises :class:`NotSettled`: not at rest within 3 s; :class:`ArmFault`: what else went wrong.
     """
     window: deque[Sample] = deque([link.fresh()])
     end = time.monotonic() + _SETTLING

@@ -150,12 +150,8 @@ class Sample:
 class Link:
     """Both connections of the library to the controller at ``host``; with ``scaling`` it reports its speed slider.
 
-    Raises
-    ------
-    ConfigError
-        The library is not installed.
-    NotReady, ControllerSilent
-        It cannot connect, or another client has the registers.
+    Raises :class:`ConfigError`: the library is not installed; :class:`NotReady`, :class:`ControllerSilent`:
+    it cannot connect, or another client has the registers.
     """
 
     def __init__(self, host: str, *, scaling: bool) -> None:

@@ -39,17 +39,10 @@ class Controller:
 def probe(settings: Settings) -> Controller:
     """Go through RTDE's handshake and the dashboard's questions.
 
-    Raises
-    ------
-    ControllerSilent
-        Nothing listens, or an answer does not come; says which.
-    NotReady
-        Not in remote control, not powered on, another arm, another payload, another program runs, a PolyScope without these
-        interfaces.
-    ProtectiveStop, EmergencyStop, SafetyStop
-        The controller has stopped the arm.
-    StaleData
-        Its clock stands still.
+    Raises :class:`ControllerSilent`: nothing listens, or an answer does not come; says which;
+    :class:`NotReady`: not in remote control, not powered on, another arm, another payload, another program
+    runs, a PolyScope without these interfaces; :class:`ProtectiveStop`, :class:`EmergencyStop`,
+    :class:`SafetyStop`: the controller has stopped the arm; :class:`StaleData`: its clock stands still.
     """
     with _Rtde(settings.host) as rtde:
         version = rtde.version()

@@ -35,12 +35,8 @@ def write_figure(kind: str, path: Path, out: Path, choice: Choice) -> str:
     ``acquisition`` takes a recording, ``preprocessing`` a view file or a recording, ``depth`` and ``normals`` a dataset or a
     shard. A ``.png``, ``.pdf`` or ``.svg`` that exists is replaced, and left alone when drawing fails.
 
-    Raises
-    ------
-    UsageError
-        The ending is unknown.
-    DataError, FormatError
-        The data are missing, damaged, or not what this kind of figure shows.
+    Raises :class:`UsageError`: the ending is unknown; :class:`DataError`, :class:`FormatError`: the data are
+    missing, damaged, or not what this kind of figure shows.
     """
     from tofcapture.viz.figures.acquisition import draw_acquisition
     from tofcapture.viz.figures.preprocessing import draw_preprocessing

@@ -41,10 +41,7 @@ _OTHER = {"lw": 0.7, "alpha": 0.7, "zorder": 2}
 def draw_acquisition(figure: Any, path: Path, scene: str | None, view: int | None) -> str:
     """Draw a recording's way around a scene (the first that is no board); returns what is on it, in words.
 
-    Raises
-    ------
-    DataError
-        It is no recording, or has no such view.
+    Raises :class:`DataError`: it is no recording, or has no such view.
     """
     if path.is_file():
         raise DataError(f"{path}: expected a recording, got a file", hint="give the folder that holds views/")

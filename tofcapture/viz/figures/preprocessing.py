@@ -49,10 +49,8 @@ def draw_preprocessing(figure: Any, path: Path, scene: str | None, view: int | N
 
     Without a ``rig`` that of the recording is used.
 
-    Raises
-    ------
-    DataError
-        There is no such view, no calibrated rig, nothing is left of the view, or the rig is of other cameras.
+    Raises :class:`DataError`: there is no such view, no calibrated rig, nothing is left of the view, or the
+    rig is of other cameras.
     """
     chosen = pick_view(path, scene, view)
     used = rig or chosen.resolve().parents[2] / "rig.toml"
@@ -73,10 +71,7 @@ def draw_preprocessing(figure: Any, path: Path, scene: str | None, view: int | N
 def preprocess(view: View, rig: Rig) -> Steps:
     """Align, crop and denoise a view with a calibrated rig and the stages of the dataset.
 
-    Raises
-    ------
-    DataError
-        The rig is of other cameras, or nothing is left.
+    Raises :class:`DataError`: the rig is of other cameras, or nothing is left.
     """
     check_cameras(view, rig)
     decoded = decoder_for(view, rig).burst(view.tof.raw, float(np.mean(view.tof.celsius)))

@@ -110,12 +110,8 @@ def object_window(on_object: NDArray[np.bool_]) -> tuple[slice, slice]:
 def read_rows(path: Path, scene: str | None, view: int, most: int, prediction: Path | None) -> list[Row]:
     """Read one view of each scene of a dataset, or of a shard; without a ``scene`` at most so many, spread evenly.
 
-    Raises
-    ------
-    DataError
-        There is no such scene, view or prediction, or it is of another size.
-    UsageError
-        One prediction for several scenes.
+    Raises :class:`DataError`: there is no such scene, view or prediction, or it is of another size;
+    :class:`UsageError`: one prediction for several scenes.
     """
     paths = _shards(path, scene, most)
     if prediction is not None and (prediction / "depth.npy").exists() and len(paths) > 1:
