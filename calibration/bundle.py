@@ -23,10 +23,8 @@ from tofcapture.poses import Float64, exp, hat, invert, invert_all, log, rotatio
 from tofcapture.rig import Rig
 
 CAMERAS = ("tof", "stereo")
-ARM_SIGMA = (
-    0.0002,
-    float(np.radians(0.01)),
-)  # m, rad per axis: a good arm's pose against its own calibration
+# m, rad per axis: a good arm's pose against its own calibration
+ARM_SIGMA = (0.0002, float(np.radians(0.01)))
 MIN_FITS = 5  # of each camera: six unknowns each, and one to spare
 STEPS = 50
 STOP = 1e-9  # m and rad

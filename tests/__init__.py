@@ -3,9 +3,8 @@
 import time
 from pathlib import Path
 
-PATIENCE = (
-    240.0  # s that a test waits for what must come; it fails on what comes wrongly, not on what comes late
-)
+# S that a test waits for what must come; it fails on what comes wrongly, not on what comes late
+PATIENCE = 240.0
 
 
 def until(condition):

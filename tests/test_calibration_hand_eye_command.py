@@ -63,6 +63,15 @@ def test_a_recording_gives_the_stereo_camera_on_the_flange(recorded):
     answers.hold("hand-eye-recording", data, off=0.05)
 
 
+def test_a_recording_gives_the_tof_camera_by_the_board(recorded):
+    """With --board the ToF camera's place comes from the board it sees, within 3 mm at this size; views without it are named."""
+    root, true = recorded
+    data = calibrate("hand-eye", root, "--board", "default").data
+    assert apart(np.array(data["T_flange_camera"]), true.T_flange_tof)[1] < 3e-3
+    assert data["camera"] == "tof"
+    assert data["pairs"] + len(data["refused"]) == 8
+
+
 def test_a_recording_of_too_few_views_is_refused(recorded, tmp_path):
     """Views that no rigid motion brings together are counted and named; an empty folder says what to record."""
     root, _ = recorded

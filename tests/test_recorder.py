@@ -115,6 +115,16 @@ def _few_candidates(monkeypatch):
     monkeypatch.setattr(plans, "object_sampling", lambda: few)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Arrays of a run that nothing disturbed."""
+    out = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        _few_candidates.__wrapped__(patch)
+        _record(out)
+    return _arrays(out)
+
+
 def _record(out, bench=None, scene="mug", views=VIEWS, frames=FRAMES, **options):
     return record((bench or Bench()).station(), scene, out, views=views, frames=frames, **options)
 
@@ -178,9 +188,8 @@ def test_a_recording_can_be_extended(tmp_path):
 
 
 @pytest.mark.parametrize("step", range(1, 26, 3))
-def test_killed_anywhere_and_run_again(tmp_path, step):
+def test_killed_anywhere_and_run_again(tmp_path, whole, step):
     """Killed without a chance to clean up, at any step of a device, then run again: the arrays of a run never killed."""
-    _record(tmp_path / "whole")
     count = iter(range(1, 1000))
 
     def die(_):
@@ -194,14 +203,13 @@ def test_killed_anywhere_and_run_again(tmp_path, step):
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) in {0, 9}
     result = _record(tmp_path / "killed")
     assert sorted({*result.recorded, *result.kept}) == list(range(VIEWS))
-    assert _arrays(tmp_path / "killed") == _arrays(tmp_path / "whole")
+    assert _arrays(tmp_path / "killed") == whole
 
 
 @pytest.mark.parametrize("where", ["write_view", "seal"])
 @pytest.mark.parametrize("after", [False, True])
-def test_killed_around_sealing(tmp_path, monkeypatch, where, after):
+def test_killed_around_sealing(tmp_path, whole, monkeypatch, where, after):
     """Killed between writing the file and its row, on either side of each: the second view is there exactly once."""
-    _record(tmp_path / "whole")
     owner, name = (recorder, "write_view") if where == "write_view" else (Journal, "seal")
     real, count = getattr(owner, name), iter(range(1000))
 
@@ -221,7 +229,7 @@ def test_killed_around_sealing(tmp_path, monkeypatch, where, after):
     result = _record(tmp_path / "killed")
     adopted = sum("adopted" in line for line in result.repaired)
     assert adopted == ((where, after) in {("write_view", True), ("seal", False)})
-    assert _arrays(tmp_path / "killed") == _arrays(tmp_path / "whole")
+    assert _arrays(tmp_path / "killed") == whole
 
 
 def test_files_are_the_truth(tmp_path):

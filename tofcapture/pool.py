@@ -197,9 +197,8 @@ def _without_script(function: Callable[..., Any]) -> Iterator[None]:
 
 def _begin(lifeline: Connection, pinned: bool) -> None:
     """Prepare a worker, before any library is loaded."""
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C reaches whoever opened the pool, who ends the workers
+    # Ctrl-C reaches whoever opened the pool, who ends the workers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     if pinned and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     threading.Thread(target=_end_with_pool, args=(lifeline,), daemon=True).start()

@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 from tofcapture.poses import Float64, invert_all, rotation_exp, transform
 
 NEAR_PI = np.radians(170)  # beyond it the sign of a rotation vector is noise
-SCALE = (
-    0.005,
-    np.radians(0.5),
-)  # m, rad: the noise of a fair station; weighs the halves until their noise is known
+# m, rad: the noise of a fair station; weighs the halves until their noise is known
+SCALE = (0.005, np.radians(0.5))
 SAMPLES, SAMPLE = 200, 4  # with 60 % good pairs 99.9999 % of draws hold a clean sample
 QUANTILE = 0.4  # of the pairs must agree; a second board may hold the rest
 QUANTILE_SIGMA = 1.37  # 40 % of 3-D Gaussian vectors are shorter than this many sigma

@@ -237,9 +237,8 @@ def _of_parts(rotations: list[Any], translations: list[Any], where: str) -> Read
 def _two_of_table(path: Path, text: str) -> tuple[Readings, Readings]:
     table, names = _table(text, str(path))
     width = table.shape[1]
-    half = {12: 6, 13: 6, 14: 7, 15: 7, 24: 12, 25: 12, 32: 16, 33: 16}.get(
-        width
-    )  # odd: a time or a number before
+    # Odd: a time or a number before
+    half = {12: 6, 13: 6, 14: 7, 15: 7, 24: 12, 25: 12, 32: 16, 33: 16}.get(width)
     if half is None or {"x", "y", "z"} <= set(names):
         raise FormatError(
             f"{path}: expected JSON, YAML, NPZ, or lines of two poses (12, 14, 24 or 32 numbers), got {width} columns",
@@ -450,9 +449,8 @@ def _by_columns(table: Float64, names: list[str], where: str) -> Readings:
         found = _of_rows(table[:, 1:] if timed else table, where)
         return replace(found, seconds=table[:, 0] if timed else None)
     units = {n.split(" ")[0]: n.split(" ")[1] for n in names if " " in n}
-    at = {
-        n.split(" ")[0]: i for i, n in enumerate(names)
-    }  # of two times the last: a header's stamp, not when it arrived
+    # Of two times the last: a header's stamp, not when it arrived
+    at = {n.split(" ")[0]: i for i, n in enumerate(names)}
     if "qx" in at and "w" in at:
         at.setdefault("qw", at["w"])
     header = next((h for h in HEADERS if set(h) <= at.keys()), None)

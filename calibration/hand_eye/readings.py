@@ -33,10 +33,8 @@ LONG = {"mm": "millimetres", "cm": "centimetres", "in": "inches", "m": "metres"}
 RARE = {"m": 0.0, "mm": 0.0, "cm": 4.0, "in": 8.0}  # what a unit that no file names is held back by
 SIZES = ((0.6, 0.8), (0.6, 0.7))  # hand and target: usual distance in m, and its spread as a logarithm
 SLIDE = 0.2  # spread of the logarithm of the ratio of units
-RATIOS, UNFIT = (
-    12,
-    0.3,
-)  # readings whose ratio is tried; misfit, as a share of the hand's spread, from which none is believed
+# Readings whose ratio is tried; misfit, as a share of the hand's spread, from which none is believed
+RATIOS, UNFIT = 12, 0.3
 UNSURE = 3.0  # between two choices of units, below which a person is told of the other
 ANGLES = (
     "rotvec", "xyz", "ZYX", "XYZ", "zyx", "about-YXZ", "about-YZX", "about-XZY", "about-ZXY", "ZXY", "YXZ", "YZX", "XZY", "zxy", "yxz",
@@ -44,9 +42,8 @@ ANGLES = (
 )  # fmt: skip
 FLIP = np.diag([1.0, 1.0, -1.0, 1.0])
 SHOWN = 40  # pairs by which readings are ranked
-CLOSE = (
-    2.0  # times the best mismatch of the angles, plus CLOSE_RAD: readings that the likelihood is asked about
-)
+# Times the best mismatch of the angles, plus CLOSE_RAD: readings that the likelihood is asked about
+CLOSE = 2.0
 CLOSE_RAD = 0.002
 MOST = 64  # readings that are solved in closed form
 RARER = 1.5

@@ -198,9 +198,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     as_json = "--json" in argv
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(
-                errors="backslashreplace"
-            )  # a latin-1 terminal shows a Greek folder all the same
+            # A latin-1 terminal shows a Greek folder all the same
+            stream.reconfigure(errors="backslashreplace")
     try:
         with _notes_on_one_line(), _terminable():
             outcome = _run(argv)

@@ -23,17 +23,13 @@ from tofcapture.poses import Float64, invert_all, rotation_angle
 
 _ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 _EDGE = 1e-10  # how far a cosine may stand outside [-1, 1] by rounding, at the border of the workspace
-HOME = np.radians(
-    [180.0, -100.0, 110.0, -100.0, -90.0, 0.0]
-)  # elbow up, flange above +x of the base, pointing down
+# Elbow up, flange above +x of the base, pointing down
+HOME = np.radians([180.0, -100.0, 110.0, -100.0, -90.0, 0.0])
 _WRIST = 1e-12  # sin q5 below which q6 is free and set to zero
 _ELBOW = np.radians(160.0)  # of a UR, to either side; beyond it the forearm's end meets the shoulder
 _MODEL_ERROR = (0.01, np.radians(1.5))  # m, rad; an arm that is farther off is another one
-_STARTS, _ROUNDS, _FOUND = (
-    4,
-    40,
-    1e-9,
-)  # of the iteration: starts for each pose, steps, and the error (m, rad) at its end
+# Of the iteration: starts for each pose, steps, and the error (m, rad) at its end
+_STARTS, _ROUNDS, _FOUND = 4, 40, 1e-9
 _TURN = (-2 * np.pi,) * 6, (2 * np.pi,) * 6
 
 

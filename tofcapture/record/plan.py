@@ -56,9 +56,8 @@ JOINT_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.25])  # in "close to home"
 _LOG_DISTANCE = 0.6  # rad per e-fold of distance: how much a nearer view counts against a turned one
 _FEW = 24  # candidates that each pick of the sampling chooses among
 _MOST_TURNS = 36
-_AIR = (
-    0.005  # m; more room than the checks before a motion ask for: an arm arrives within 0.02 deg, not exactly
-)
+# m; more room than the checks before a motion ask for: an arm arrives within 0.02 deg, not exactly
+_AIR = 0.005
 
 
 @dataclass(frozen=True)

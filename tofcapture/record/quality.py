@@ -39,9 +39,8 @@ _BLOCK = 20  # px; side of the blocks whose means are compared between frames
 _CLOCKS = 50_000_000  # ns; how far a device's idea of the host's clock may be off
 _BRIGHT = 50.0  # raw units; noise plays no part in how taps fit each other, and the other camera
 _FEW = 500  # bright pixels, or points that both cameras see, below which nothing is said of that
-_SPREAD = (
-    0.05  # rad; better than that multipath and edges let no phase agree with the stereo camera's distances
-)
+# rad; better than that multipath and edges let no phase agree with the stereo camera's distances
+_SPREAD = 0.05
 _FAINT = 50.0  # raw units; changes of fainter blocks are told in parts of this
 
 
@@ -252,9 +251,8 @@ TILTS = (0.0, 8.0, 15.0, 25.0, 40.0, 90.0)  # deg
 TILTED = 8.0  # deg; a board less tilted leans in no direction
 CELLS = (9, 12)  # of the image
 _TURN = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-DISC = 0.2 * np.column_stack(
-    [np.cos(_TURN), np.sin(_TURN)]
-)  # m; the outline that stands for the board's while recording
+# m; the outline that stands for the board's while recording
+DISC = 0.2 * np.column_stack([np.cos(_TURN), np.sin(_TURN)])
 
 
 def board_pose(centre: Float64, normal: Float64) -> Float64:

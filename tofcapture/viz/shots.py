@@ -105,9 +105,8 @@ def scales_of(panels: Sequence[Panel]) -> dict[str, Scale]:
     return scales
 
 
-_AZIMUTH, _ELEVATION = np.radians(
-    (40.0, 20.0)
-)  # from where clouds are seen: beside the camera, above the table
+# From where clouds are seen: beside the camera, above the table
+_AZIMUTH, _ELEVATION = np.radians((40.0, 20.0))
 _SHADE = 60.0  # how dark a step of depth makes a point, per unit of the picture's extent
 _MARGIN = 0.06  # of the extent
 

@@ -127,9 +127,8 @@ class TorchDecoder:
         start, period = self._wraps.start, self._wraps.period
         fused = fused - torch.floor((fused - start) / period) * period
         depth = (fused.square() - self._quarter) / (fused * self._length - self._slant)
-        valid = (
-            sure & (fused > self._nearest) & (depth > MIN_RANGE) & (depth < MAX_RANGE)
-        )  # false where it is no number
+        # False where it is no number
+        valid = sure & (fused > self._nearest) & (depth > MIN_RANGE) & (depth < MAX_RANGE)
         gap = torch.where(lit, unwrapped[0] - unwrapped[-1], torch.zeros_like(fused))
         ends = [0, F, F - 1, 2 * F - 1]
         frame = Frame(

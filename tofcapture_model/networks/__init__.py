@@ -74,9 +74,8 @@ def select_stage(model: Model, stage: str) -> list[nn.Parameter]:
     """Freeze all parameters but those that learn in ``stage``; return these. All of a baseline learn in its only stage."""
     for name, parameter in model.named_parameters():
         learns = isinstance(model, Baseline) or name.split(".")[0] in PARTS[stage]
-        parameter.requires_grad_(
-            learns and parameter.numel() > 0
-        )  # a refinement of no rounds has empty gains
+        # A refinement of no rounds has empty gains
+        parameter.requires_grad_(learns and parameter.numel() > 0)
     return [p for p in model.parameters() if p.requires_grad]
 
 

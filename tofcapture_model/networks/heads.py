@@ -35,10 +35,8 @@ from tofcapture_model.networks.unet import (
 
 CUE_SCALE = (1.0, 1.0, 0.01, 0.3)  # what one may expect of each cue: most lenses scatter about one percent
 RESIDUAL_UNIT = 0.01  # m; a head's output of 1 moves the depth by a centimetre
-MIDDLE, REACH = (
-    0.8,
-    0.4,
-)  # m; where depth starts, and a head's unit, where the decoded depth is not to be seen
+# m; where depth starts, and a head's unit, where the decoded depth is not to be seen
+MIDDLE, REACH = (0.8, 0.4)
 FIT_RADII = (1, 2)  # px of the sensor, of the planes that compact fits to its own depth
 _HEAD_WIDTH = 24
 _HOLE = 1e-3  # weight of a filled pixel

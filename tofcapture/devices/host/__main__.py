@@ -58,9 +58,8 @@ class Child:
             self._call(number, verb, args, token)
 
     def _call(self, number: int, verb: str, args: tuple[Any, ...], token: object) -> None:
-        self._moving = (
-            number if verb == "move_to" else 0
-        )  # before the check: a stop that comes after it sees that something moves
+        # Before the check: a stop that comes after it sees that something moves
+        self._moving = number if verb == "move_to" else 0
         try:
             if self._moving:
                 self._latch.check(token)

@@ -45,9 +45,8 @@ class Settings:
     speed: float = 0.5  # of joints, rad/s
     camera_speed: float = 0.25  # of flange and cameras, m/s
     acceleration: float = 0.5  # rad/s^2
-    max_step_deg: float = (
-        150.0  # largest turn of a joint in one motion: a change of the kinematic branch is larger
-    )
+    # Largest turn of a joint in one motion: a change of the kinematic branch is larger
+    max_step_deg: float = 150.0
     watchdog_hz: float = 2.0  # the controller stops the program when it hears less often from us
     settle: float = 0.3  # s of ringing after the arm is measured at rest
     payload: float = float("nan")  # expected, kg; NaN for any

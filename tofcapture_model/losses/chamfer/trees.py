@@ -25,19 +25,15 @@ Point = tuple[np.float32, np.float32, np.float32]
 
 SIDE, FAN = 4, 16
 _MARGIN = 1e-6  # of the largest coordinate: rounding of a shifted query
-_SAMPLE, _TOGETHER = (
-    32,
-    4,
-)  # one of so many leaves is asked for every shift first, so many neighbours at a time
+# One of so many leaves is asked for every shift first, so many neighbours at a time
+_SAMPLE, _TOGETHER = (32, 4)
 _STEPS, _STEP = 16, 64  # at most so many steps in which other shifts are asked, of at least so many leaves
 _TASK = 256  # leaves of a thread's task
 _WORTH_A_THREAD = 10_000  # queries of one shift
 
 _ZERO, _INF, _ONE = np.float32(0), np.float32(np.inf), np.uint32(1)
-_FACTOR, _TOP = (
-    np.uint32(0x077CB531),
-    np.uint32(27),
-)  # de Bruijn: the top five bits tell how far it was shifted
+# De Bruijn: the top five bits tell how far it was shifted
+_FACTOR, _TOP = (np.uint32(0x077CB531), np.uint32(27))
 _POSITION = np.zeros(32, np.int64)
 for _k in range(32):
     _POSITION[(0x077CB531 << _k & 0xFFFFFFFF) >> 27] = _k
