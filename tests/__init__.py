@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 
-# S that a test waits for what must come; it fails on what comes wrongly, not on what comes late
+# s that a test waits for what must come; it fails on what comes wrongly, not on what comes late
 PATIENCE = 240.0
 
 

@@ -248,10 +248,7 @@ def test_eth_streams_repeat():
 
 
 CLOCKS = {
-    "seconds": (lambda t: t, 0.0, "s,"),
-    "an epoch apart": (lambda t: t + 1.7e9, 1.7e9, "s,"),
     "nanoseconds of an epoch": (lambda t: np.round(1e9 * (t + 1.7e9)), 1.7e9, "ns,"),
-    "milliseconds since boot": (lambda t: 1e3 * t, 0.0, "ms,"),
     "a zero among wall-clock times": (
         lambda t: np.where(np.arange(len(t)) == 500, 0, t + 1.7e9),
         1.7e9,
@@ -300,9 +297,7 @@ def test_time_offset_of_foreign_or_periodic_streams_is_refused():
         assert caught.value.cause == Cause.TIME_OFFSET
 
 
-@pytest.mark.parametrize(
-    ("factor", "eye_to_hand"), [(1.01, False), (1.03, True), (1.06, False), (1.2, True), (3.0, False)]
-)
+@pytest.mark.parametrize(("factor", "eye_to_hand"), [(1.01, False), (1.06, True), (3.0, False)])
 def test_a_wrong_target_size_is_solved_for_and_fails(factor, eye_to_hand):
     """A target measured too large or too small gives the right X, within its error bar, and a verdict that nobody overlooks."""
     A, B, X = station(7, 40, eye_to_hand=eye_to_hand)
@@ -319,8 +314,8 @@ def test_a_wrong_target_size_is_solved_for_and_fails(factor, eye_to_hand):
 
 
 def test_a_right_target_size_is_believed():
-    """Of ten stations with the right size one at most is solved with another, and none fails; a given factor is obeyed."""
-    results = [solve_hand_eye(*station(seed, 25)[:2]) for seed in range(10)]
+    """Of six stations with the right size one at most is solved with another, and none fails; a given factor is obeyed."""
+    results = [solve_hand_eye(*station(seed, 25)[:2]) for seed in range(6)]
     assert sum(r.scale_used != 1 for r in results) <= 1
     assert not any(r.failures for r in results)
     A, B, X = station(3, 25)

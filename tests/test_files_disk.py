@@ -130,12 +130,14 @@ def test_only_exact_names_are_views(tmp_path, capsys):
     problems = [p.message for p in check(tmp_path)]
     assert len(problems) == len(told)
     assert all(message.startswith("passed over") for message in problems)
-    for command in (["align"], ["figure", "acquisition", "--out", "x.png"], ["view", "--png", "x.png"]):
-        main(
-            [*command[:2], str(tmp_path), *command[2:]]
-            if command[0] == "figure"
-            else [command[0], str(tmp_path), *command[1:]]
-        )
+    shown = str(tmp_path / "x.png")
+    where = str(tmp_path)
+    for command in (
+        ["align", where],
+        ["figure", "acquisition", where, "--out", shown],
+        ["view", where, "--png", shown],
+    ):
+        main(command)
         assert "view-000 (1).h5: passed over" in capsys.readouterr().err
 
 
