@@ -334,7 +334,7 @@ def configure_phase_order(parser: argparse.ArgumentParser) -> None:
 def run_phase_order(args: argparse.Namespace) -> Outcome:
     """Find frequency, order, sign and start of the phases of raw frames."""
     from calibration.phase_order.find import find_phase_order
-    from calibration.phase_order.raw_files import read_raw
+    from tofcapture.importing.raw import read_raw
 
     hz = [1e6 * f for f in _listed("--mhz", args.mhz, float, "numbers such as 20,100")]
     reference = None if args.reference is None else _array(args.reference)

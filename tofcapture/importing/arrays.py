@@ -14,10 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError, DataError, FormatError
-from tofcapture.importing.said import Said
-from tofcapture.importing.source import Facts, Piece
+from tofcapture.importing.said import Facts, Said
+from tofcapture.importing.source import Piece
 
 SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".hdf")
+_KINDS = {
+    ".npy": "NumPy",
+    ".npz": "NumPy",
+    ".mat": "MATLAB",
+    **dict.fromkeys((".h5", ".hdf5", ".hdf"), "HDF5"),
+}
 CHANNELS = ("modulation_hz", "phase_rad", "offset", "saturation")  # what may lie beside an array
 
 
@@ -78,7 +84,7 @@ def arrays_of(path: Path) -> dict[str, NDArray[Any]]:
         return _hdf5(path, turned=suffix == ".mat")
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError) as err:
         raise FormatError(
-            f"{path}: cannot read the array: {err}",
+            f"{path}: cannot read the array of a {_KINDS[suffix]} file: {err}",
             hint="copy the file again, or write it with np.save"
             if suffix.startswith(".n")
             else "copy it again",
@@ -86,8 +92,7 @@ def arrays_of(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _numpy(path: Path) -> dict[str, NDArray[Any]]:
-    mapped = "r" if path.suffix.lower() == ".npy" else None
-    found = np.load(path, allow_pickle=False, mmap_mode=mapped)
+    found = np.load(path, allow_pickle=False, mmap_mode="r" if path.suffix.lower() == ".npy" else None)
     if isinstance(found, np.ndarray):
         return {"": found}
     with found:

@@ -14,6 +14,7 @@ from tofcapture.errors import ConfigError, FormatError
 from tofcapture.importing.rules import roughness
 from tofcapture.importing.said import Said
 from tofcapture.importing.source import Piece
+from tofcapture.importing.vendors import decode, facts_of_bytes, layout_of
 
 IMAGES = (".png", ".tif", ".tiff", ".pgm", ".bmp")
 BINARY = (".raw", ".bin")
@@ -29,8 +30,16 @@ def pieces(path: Path, said: Said) -> Iterator[Piece]:
     if path.suffix.lower() in IMAGES:
         yield Piece("", path, partial(read_image, path))
         return
-    shape, dtype = said.tuple_of("raw", "shape"), str(said.raw.get("dtype", ""))
-    yield Piece("", path, partial(read_words, path, tuple(map(int, shape)), dtype))
+    shape, dtype = tuple(map(int, said.tuple_of("raw", "shape"))), str(said.raw.get("dtype", ""))
+    if not (layout := layout_of(path, said)):
+        yield Piece("", path, partial(read_words, path, shape, dtype))
+        return
+    yield Piece("", path, partial(_decoded, path, layout, shape), facts=facts_of_bytes(path, layout))
+
+
+def _decoded(path: Path, layout: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    images = decode(path.read_bytes(), layout, shape, str(path))
+    return images[0] if len(images) == 1 else images
 
 
 def read_image(path: Path) -> NDArray[Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -82,7 +83,7 @@ def seen(view: View, T: np.ndarray) -> Float32:
 def _better(tof: Float32, truth: Float32, view: View, off: float) -> str:
     """Say how ground truth would have to be read to agree much better; nothing when no reading does."""
     lengths = view.tof.info.camera.ray_lengths
-    readings = {
+    readings: dict[str, Any] = {
         "it is mirrored left to right: flip it with np.fliplr": truth[:, ::-1],
         "it is upside down: flip it with np.flipud": truth[::-1],
         "it is turned by half a turn: np.rot90(depth, 2)": truth[::-1, ::-1],

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.view import check_scene_name
 from tofcapture.importing.rules import in_order
-from tofcapture.importing.said import Said
-from tofcapture.importing.source import Facts, Piece, find_pieces, natural
+from tofcapture.importing.said import Facts, Said
+from tofcapture.importing.source import Piece, Role, find_pieces, natural
+from tofcapture.importing.vendors import decode, facts_of_layout
 
 TRUTH = frozenset(
     [
@@ -99,7 +101,7 @@ class _Named:
     """What a piece's name says."""
 
     piece: Piece
-    role: str
+    role: Role
     words: tuple[str, ...]  # that are no role and no axis: a scene's name
     folders: int  # of these words, those of folders
     numbers: tuple[tuple[str, int], ...]  # (word before, number)
@@ -115,6 +117,7 @@ def plan(source: Path, said: Said) -> list[Planned]:
     if not any(n.role == "raw" for n in named):
         # Names that say nothing are raw, unless others say that they are.
         named = [replace(n, role="raw") if n.role == "" else n for n in named]
+    named = [_taken_apart(n, said) if n.role == "raw" else n for n in named]
     raw = _scenes([n for n in named if n.role == "raw"], said, source)
     if not raw:
         raise DataError(
@@ -151,12 +154,27 @@ def _named(piece: Piece, said: Said) -> _Named:
             if low not in AXIS:
                 words.append(word)
                 folders += depth < len(parts) - 1
-    role = piece.role or next((r for r in ("truth", "raw", "other") if r in roles), "")
-    for table, name in ((said.truth, "truth"), (said.raw, "raw")):
+    said_role: tuple[Role, ...] = ("truth", "raw", "other")
+    role: Role = piece.role or next((r for r in said_role if r in roles), "")
+    kinds: tuple[tuple[Mapping[str, Any], Role], ...] = ((said.truth, "truth"), (said.raw, "raw"))
+    for table, name in kinds:
         if pattern := table.get("files"):
             matches = fnmatch(piece.name, str(pattern)) or fnmatch(Path(place).name, str(pattern))
             role = name if matches else ("" if role == name else role)
     return _Named(piece, role, tuple(words), folders, tuple(numbers))
+
+
+def _taken_apart(named: _Named, said: Said) -> _Named:
+    """Read an array that holds a camera's bytes by its layout; files of bytes are read so already."""
+    layout, piece = str(said.raw.get("layout", "")), named.piece
+    if not layout or piece.facts.model == layout:
+        return named
+    shape = tuple(map(int, said.tuple_of("raw", "shape")))
+
+    def load() -> Array:
+        return decode(piece.load().tobytes(), layout, shape, str(piece.path))
+
+    return replace(named, piece=replace(piece, load=load, facts=piece.facts.over(facts_of_layout(layout))))
 
 
 def _scenes(named: Sequence[_Named], said: Said, source: Path) -> dict[str, list[_Named]]:
@@ -201,19 +219,32 @@ def _views(
                 f"{pieces[0].path}: expected arrays of one size, got {_some(map(str, sorted(sizes)))}",
                 hint='leave out what does not belong: [raw] files = "..." in import.toml',
             )
-        where, array = str(pieces[0].path), arrays[0] if len(arrays) == 1 else np.stack(arrays)
-        if len(arrays) == 1 or arrays[0].ndim == 2:
-            return in_order(array, K, size, axes, where)
+        where = str(pieces[0].path)
+        if len(arrays) == 1:
+            return in_order(arrays[0], K, size, axes, where)
+        if not axes and (arrays[0].ndim == 2 or (arrays[0].ndim == 3 and len(arrays[0]) < K)):
+            join = np.stack if arrays[0].ndim == 2 else np.concatenate
+            return in_order(join(arrays), K, size, "", where)
         frames = [in_order(a, K, size, axes, where)[0] for a in arrays]
         return np.concatenate(frames)[None]
 
     if len(groups) == 1:
         return _of_one(next(iter(groups.values())), truth, read, source)
     targets = _paired(groups, truth, source)
-    out = []
-    for (_, pieces), target in zip(groups.items(), targets, strict=True):
-        out.append(_planned(pieces, lambda pieces=pieces: read(pieces)[0], target, None))
-    return out
+    return [
+        _planned(pieces, partial(_first, read, pieces), target, None)
+        for pieces, target in zip(groups.values(), targets, strict=True)
+    ]
+
+
+def _first(read: Callable[[list[Piece]], Array], pieces: list[Piece]) -> Array:
+    found: Array = read(pieces)[0]
+    return found
+
+
+def _part(load: Callable[[], Array], i: int | None) -> Array:
+    found: Array = load() if i is None else load()[i]
+    return found
 
 
 def _of_one(
@@ -232,9 +263,9 @@ def _of_one(
                 f"{source}: expected ground truth for {count} views, got {n} of {targets[0].name}",
                 hint='one depth a view; [raw] axes = "NFKHW" says what the axes of the raw array are',
             )
-        single = targets[0]
-        loads = [lambda i=i: single.load()[i] if n > 1 else single.load() for i in range(count)]
-        return [replace(_planned(pieces, lambda i=i: array[i], single, loads[i])) for i in range(count)]
+        one = targets[0]
+        parts = [partial(_part, one.load, i if n > 1 else None) for i in range(count)]
+        return [_planned(pieces, partial(array.__getitem__, i), one, parts[i]) for i in range(count)]
     if count == 1 and len(targets) == array.shape[1] > 1:
         array, count = array[0][:, None], array.shape[1]
     if len(targets) not in (0, count):
@@ -243,7 +274,8 @@ def _of_one(
             hint="one depth a view, numbered as the raw arrays",
         )
     return [
-        _planned(pieces, lambda i=i: array[i], targets[i] if targets else None, None) for i in range(count)
+        _planned(pieces, partial(array.__getitem__, i), targets[i] if targets else None, None)
+        for i in range(count)
     ]
 
 
@@ -273,17 +305,22 @@ def _grouped(raw: list[_Named], said: Said, K: int) -> dict[Key, list[Piece]]:
     """Group raw pieces into views by the numbers in their names; the pieces of a group are in order: frames, then channels."""
     raw = sorted(raw, key=lambda n: natural(n.piece.name))
     first = raw[0].piece.load()
-    per_piece = first.ndim == 2 and not said.raw.get("axes")  # one channel a file
+    few = first.ndim == 2 or (
+        first.ndim == 3 and len(first) < K and K % len(first) == 0 and first.shape[-1] != K
+    )
+    need = (
+        K // (len(first) if first.ndim == 3 else 1) if few and not said.raw.get("axes") else 1
+    )  # files of a frame
     if len({len(n.numbers) for n in raw}) > 1 or len(raw) == 1:
-        return _in_turn(raw, K if per_piece else 1)
+        return _in_turn(raw, need)
     columns = [[n.numbers[i] for n in raw] for i in range(len(raw[0].numbers))]
     varying = [i for i, column in enumerate(columns) if len({v for _, v in column}) > 1]
     many = {i: len({v for _, v in columns[i]}) for i in varying}
     if prod(many.values()) != len(raw):
-        return _in_turn(raw, K if per_piece else 1)
-    inner = _channel_columns(varying, many, columns, K) if per_piece else []
-    if per_piece and not inner:
-        return _in_turn(raw, K)
+        return _in_turn(raw, need)
+    inner = _channel_columns(varying, many, columns, need) if need > 1 else []
+    if need > 1 and not inner:
+        return _in_turn(raw, need)
     rest = [i for i in varying if i not in inner]
     frames = [i for i in rest if columns[i][0][0] in FRAME]
     frames = frames if len(frames) < len(rest) else []

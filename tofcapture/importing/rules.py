@@ -78,7 +78,20 @@ def check_unit(raw: NDArray[Any], info: TofInfo, path: object) -> str:
     )
 
 
-def check_taps(raw: NDArray[np.float64], info: TofInfo, path: object, which: str = "") -> None:
+def burst_mean(raw: NDArray[Any], info: TofInfo) -> NDArray[np.float64]:
+    """Average a burst (F, K, H, W).
+
+    A tap that is saturated in any frame gets the saturation value: clipping took from its mean what nobody knows.
+    :meth:`tofcapture.ops.phase.Decoder.burst` has the same rule.
+    """
+    mean: NDArray[np.float64] = raw.mean(axis=0, dtype=np.float64)
+    mean[info.saturated(raw).any(axis=0)] = info.saturation
+    return mean
+
+
+def check_taps(
+    raw: NDArray[np.float64], info: TofInfo, path: object, which: str = "", *, calibrated: bool = True
+) -> str:
     """Refuse taps (K, H, W) that cannot be what ``info`` says: other units, other channels, no signal.
 
     What no cosine explains vanishes for the right order, where a frequency has four phases. Ranges of all frequencies agree up to
@@ -99,27 +112,32 @@ def check_taps(raw: NDArray[np.float64], info: TofInfo, path: object, which: str
     bright = (weaker >= np.nanmedian(weaker)) & (weaker > 0)
     if not bright.any():
         raise DataError(f"{where}: no modulated light: the phases are equal everywhere")
-    found = _contradiction(
-        raw[:, bright], amplitude[:, bright], signals.ranges[:, bright], maps.depth[bright], info
-    )
-    if found:
+    found = _misfit(raw[:, bright], amplitude[:, bright], info)
+    apart = found or _disagreement(signals.ranges[:, bright], maps.depth[bright], info)
+    if found or (apart and calibrated):
+        found = apart
         hint = f"tofcapture calibrate phase-order {path} says what the channels are; reorder them"
         raise DataError(
             f"{where}: {found}; expected channels: {channels_in_words(info.modulation_hz, info.phase_rad)}",
             hint=f"{hint}; or take another --frame, or --average, if only this one is so" if which else hint,
         )
+    return apart
 
 
-def _contradiction(
-    raw: NDArray[np.float64], amplitude: Float32, ranges: Float32, depth: Float32, info: TofInfo
-) -> str:
-    """Say what of taps (K, N), amplitudes (F, N), ranges (F, N) and depths (N,) cannot be; nothing when all is well."""
-    rows, hz = tap_rows(info), frequencies(info.modulation_hz)
+def _misfit(raw: NDArray[np.float64], amplitude: Float32, info: TofInfo) -> str:
+    """Say by how much taps (K, N) of amplitudes (F, N) fit no cosine; nothing when they do."""
+    rows = tap_rows(info)
     for size, (first, count) in zip(amplitude, rows.spare, strict=True):
         spare = rows.weights[first : first + count] @ raw
         harmonic = float(np.median(2 * np.sqrt(np.square(spare).mean(axis=0)) / size)) if count else 0.0
         if harmonic > _HARMONIC:
             return f"taps half a period apart do not add up, by {harmonic:.1f} of the amplitude"
+    return ""
+
+
+def _disagreement(ranges: Float32, depth: Float32, info: TofInfo) -> str:
+    """Say how ranges (F, N) and depths (N,) cannot be; nothing when all is well."""
+    hz = frequencies(info.modulation_hz)
     apart = wrap_table(hz, information(info), info.reach).apart
     agreement = float(np.cos(2 * np.pi * np.minimum(mismatch(ranges.T, hz) / apart, 0.5)).mean())
     if agreement < _AGREEMENT:

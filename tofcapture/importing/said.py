@@ -79,6 +79,8 @@ class Said:
         phases = self.tuple_of("tof", "phase_deg", np.pi / 180) or facts.phase_rad
         if not hz and not phases:
             return PAPER_MODULATION_HZ, PAPER_PHASE_RAD
+        if len(hz) == 1:
+            hz *= len(phases)
         if len(hz) != len(phases):
             raise ConfigError(
                 f"{self.where}: [tof]: expected a phase for each modulation frequency, got {len(hz)} and {len(phases)}",

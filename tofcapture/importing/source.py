@@ -25,7 +25,7 @@ from tofcapture.importing.said import Facts, Said
 from tofcapture.poses import Float64
 
 Role = Literal["", "raw", "truth", "pose", "other"]
-READERS = ("vendors", "arrays", "images")
+READERS = ("arrays", "images")
 """Modules of this package, asked in this order; the first that claims a path reads it."""
 
 

@@ -82,7 +82,7 @@ def _of_depth(
             hint="the (4, 4) that maps its frame to the ToF frame, metres; rows of numbers in import.toml",
         )
     own = camera or tof
-    z = depth / own.ray_lengths.astype(np.float32) if radial else depth
+    z = np.asarray(depth / own.ray_lengths if radial else depth, dtype=np.float32)
     z = rectified(z, own)
     pinhole = Camera(own.width, own.height, own.fx, own.fy, own.cx, own.cy)
     points = (z[..., None] * pinhole.rays).astype(np.float32)
@@ -125,11 +125,11 @@ def _of_points(
             f"{where}: expected an organised point map (H, W, 3), got shape {values.shape}",
             hint='a cloud without rows and columns is kind = "mesh"; a depth image is kind = "depth"',
         )
-    points = np.asarray(values, dtype=np.float64)
-    empty = ~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)
-    depth = metres(np.where(empty, 0.0, points[..., 2]), unit, missing, where)
-    scale = np.nanmedian(depth / np.where(empty, np.nan, points[..., 2]))
-    points = (points * scale).astype(np.float32)
+    given = np.asarray(values, dtype=np.float64)
+    empty = ~np.isfinite(given).all(axis=-1) | (given == 0).all(axis=-1)
+    depth = metres(np.where(empty, 0.0, given[..., 2]), unit, missing, where)
+    scale = np.nanmedian(depth / np.where(empty, np.nan, given[..., 2]))
+    points = np.asarray(given * scale, dtype=np.float32)
     points[~np.isfinite(depth)] = np.nan
     fitted = camera or pinhole_of(points, where)
     if T is None:

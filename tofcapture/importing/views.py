@@ -20,7 +20,7 @@ from tofcapture.files.view import open_view, view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, View
 from tofcapture.importing.overlap import Overlap, compare
 from tofcapture.importing.plan import Planned, plan
-from tofcapture.importing.rules import check_taps, check_unit, expect_finite, signed
+from tofcapture.importing.rules import burst_mean, check_taps, check_unit, expect_finite, signed
 from tofcapture.importing.said import NAME, Said, read_said
 from tofcapture.importing.truth import point_map
 from tofcapture.poses import Float64
@@ -163,7 +163,9 @@ def make_view(planned: Planned, said: Said) -> tuple[View, Overlap]:
     where = planned.pieces[0].name
     raw = integers(planned.raw(), where)
     info = said.tof_info(planned.facts, (raw.shape[-2], raw.shape[-1]))
-    warning = judged(raw, info, where)
+    warning = judged(
+        raw, info, where, known=bool(planned.facts.modulation_hz or "modulation_mhz" in said.tof)
+    )
     found = point_map(planned, said, info.camera)
     rig = Rig(info.camera, found.camera, found.T_tof_stereo, np.eye(4), info.illuminator, (), info.reach)
     stamps = planned.time_ns if len(planned.time_ns) == len(raw) else tuple(range(len(raw)))
@@ -211,12 +213,17 @@ def integers(raw: NDArray[Any], where: str) -> NDArray[Any]:
     return raw.astype(kind)
 
 
-def judged(raw: NDArray[Any], info: TofInfo, where: str) -> str:
-    """Refuse taps (F, K, H, W) that cannot be what ``info`` says; return what looks wrong and may be right."""
+def judged(raw: NDArray[Any], info: TofInfo, where: str, *, known: bool) -> str:
+    """Refuse taps (F, K, H, W) that cannot be what ``info`` says; return what looks wrong and may be right.
+
+    Channels that somebody named are ``known``: their ranges may disagree by what nobody has calibrated yet.
+    """
     expect_finite(raw, where)
-    warning = check_unit(raw, info, where)
-    check_taps(raw.mean(axis=0, dtype=np.float64), info, where)
-    return warning
+    odd = check_unit(raw, info, where)
+    apart = check_taps(burst_mean(raw, info), info, where, calibrated=not known)
+    if apart:
+        return f"{where}: {apart}: is the camera calibrated? tofcapture calibrate range"
+    return "" if known else odd
 
 
 def _keep_rig(out: Path, rig: Rig, model: str) -> None:

@@ -18,9 +18,10 @@ from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.disk import check_writable
 from tofcapture.frames import TofInfo
+from tofcapture.importing.rules import expect_finite
 from tofcapture_model.config import BASELINES
 from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
-from tofcapture_model.data.raw_input import RawInput, expect_finite, read_input, taken
+from tofcapture_model.data.raw_input import RawInput, read_input, taken
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
 from tofcapture_model.geometry.decoder import Taps, TorchDecoder
 from tofcapture_model.inference.prediction import Prediction, write_prediction

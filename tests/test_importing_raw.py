@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from calibration.phase_order.find import find_phase_order
-from calibration.phase_order.raw_files import read_raw, signed, without_metadata
 from tests.test_calibration_phase_order import SHAPE, made, same
 from tofcapture.errors import DataError, FormatError
+from tofcapture.importing.raw import read_raw
+from tofcapture.importing.rules import signed, without_metadata
 
 HZ = (20e6, 100e6)
 
@@ -107,13 +108,13 @@ def broken(tmp_path):
     return {
         "none.npy": (DataError, "no such file"),
         "seven.npy": (DataError, "K of 8"),
-        "words.npy": (FormatError, "numbers"),
+        "words.npy": (DataError, "numbers"),
         "pickled.npy": (FormatError, "npy"),
         "two.npz": (FormatError, "one array"),
         "flat.h5": (FormatError, "one a channel"),
         "cut.h5": (FormatError, "HDF5"),
         "words.raw": (FormatError, "size"),
-        "page.pdf": (FormatError, r"\.pdf"),
+        "page.pdf": (DataError, r"page\.pdf"),
         folder("empty"): (DataError, "images"),
         dead: (FormatError, "an image"),
         folder("colour", *[colours] * 8): (FormatError, "colours"),
