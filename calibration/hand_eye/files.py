@@ -21,7 +21,8 @@ from zipfile import BadZipFile
 import numpy as np
 
 from calibration.hand_eye.readings import UNITS, Readings, angle_names
-from tofcapture.errors import ConfigError, DataError, FormatError
+from tofcapture.errors import DataError, FormatError
+from tofcapture.importing.cameras.trees import decoded, parsed_xml, yaml_tree
 from tofcapture.poses import Float64
 
 UNIT_LENGTH = 0.01  # a quaternion's length may be off one by this: printed with three digits
@@ -483,7 +484,7 @@ def _content(path: Path) -> Any:
             from scipy.io import loadmat
 
             return {k: v.tolist() for k, v in loadmat(path).items() if not k.startswith("__")}
-        return _of_text(_decoded(path.read_bytes()), suffix, path)
+        return _of_text(decoded(path.read_bytes()), suffix, path)
     except FileNotFoundError as err:
         raise DataError(f"{path}: no such file") from err
     except (ValueError, OSError, EOFError, BadZipFile, NotImplementedError, ET.ParseError) as err:
@@ -493,15 +494,6 @@ def _content(path: Path) -> Any:
             f"{path}: expected {kinds.get(suffix, 'text')}, got {err or type(err).__name__}",
             remedy if suffix in {".npz", ".npy"} else "save as MATLAB 5 (-v7)" if suffix == ".mat" else "",
         ) from err
-
-
-def _decoded(data: bytes) -> str:
-    """Text in UTF-8 or, as Windows' tools write it, in UTF-16 with or without a mark."""
-    if data[:2] in {b"\xff\xfe", b"\xfe\xff"}:
-        return data.decode("utf-16")
-    if data[1:2] == b"\0" and len(data) > 2:
-        return data.decode("utf-16-le")
-    return data.decode("utf-8-sig")
 
 
 def _of_text(text: str, suffix: str, path: Path) -> Any:
@@ -514,48 +506,11 @@ def _of_text(text: str, suffix: str, path: Path) -> Any:
         except ValueError:
             return text  # arrays line by line, or KUKA's braces
     if begins.startswith("<"):
-        if "<!ENTITY" in text:
-            raise FormatError(f"{path}: expected OpenCV's XML, got entities")
-        return _xml(ET.fromstring(text))  # noqa: S314  without entities nothing grows
+        return parsed_xml(text, path)
     if (
         suffix in {".yaml", ".yml"}
         or begins == "%YAML"
         or re.match(r"(header|pose|transform\w*):\s", text.lstrip())
     ):
-        return _yaml(text, path)
+        return yaml_tree(text, path)
     return text
-
-
-def _xml(node: ET.Element) -> Any:
-    """Dictionaries, lists and matrices of OpenCV's XML."""
-    if node.get("type_id") == "opencv-matrix":
-        held = {child.tag: (child.text or "").split() for child in node}
-        return {"rows": held["rows"][0], "cols": held["cols"][0], "data": held["data"]}
-    if not len(node):
-        return (node.text or "").split()
-    tags = [child.tag for child in node]
-    if tags[0] == "_":
-        return [_xml(child) for child in node]
-    return {child.tag: _xml(child) for child in node}
-
-
-def _yaml(text: str, path: Path) -> Any:
-    try:
-        import yaml
-    except ImportError as err:
-        raise ConfigError(
-            f"{path}: reading YAML needs PyYAML", hint="pip install pyyaml, or convert to JSON"
-        ) from err
-
-    class Loader(yaml.SafeLoader):  # type: ignore[misc]
-        """Knows the tag of OpenCV's matrices."""
-
-    Loader.add_constructor(
-        "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
-    )
-    try:
-        documents = list(yaml.load_all(re.sub(r"^%YAML.*\n", "", text.lstrip()), Loader))
-    except yaml.YAMLError as err:
-        raise FormatError(f"{path}: expected YAML, got {str(err)[:200]}") from err
-    documents = [d for d in documents if d is not None]
-    return documents[0] if len(documents) == 1 else documents

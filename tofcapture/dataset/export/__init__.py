@@ -21,7 +21,8 @@ from tofcapture.dataset.export.tables import (
     finish_lerobot,
 )
 from tofcapture.errors import ConfigError, FormatError
-from tofcapture.files.manifest import SPLITS, load_manifest, load_signed, signed_text
+from tofcapture.files.layout import SPLITS
+from tofcapture.files.manifest import load_manifest, load_signed, signed_text
 from tofcapture.files.seal import sealed_digest, sha256_of, write_text
 from tofcapture.files.shard import ShardReader
 

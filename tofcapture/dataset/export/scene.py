@@ -37,7 +37,8 @@ class SceneExport:
 def grey(amplitude: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Show amplitude (H, W) in 8 bits, brightest at its 99.5th percentile."""
     top = max(percentile([amplitude], 99.5, 1.0), 1e-9)
-    return np.rint(np.nan_to_num(np.clip(amplitude / top, 0, 1)) * 255).astype(np.uint8)
+    out: NDArray[np.uint8] = np.rint(np.nan_to_num(np.clip(amplitude / top, 0, 1)) * 255).astype(np.uint8)
+    return out
 
 
 def quaternion(T: Float64) -> list[float]:

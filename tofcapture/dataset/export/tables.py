@@ -170,7 +170,7 @@ def export_lerobot(scene: SceneExport) -> list[Path]:
         tof, gt = shard.tof(view), shard.ground_truth(view, 2)
         picture = np.repeat(grey(tof.confidence)[..., None], 3, axis=-1)
         depths = {"tof": np.nan_to_num(tof.depth), "ground_truth": np.nan_to_num(gt.depth)}
-        seen = {"observation.images.amplitude": np.moveaxis(picture, -1, 0) / 255}
+        seen: dict[str, Any] = {"observation.images.amplitude": np.moveaxis(picture, -1, 0) / 255}
         seen |= {f"observation.depth.{name}": depth[None] for name, depth in depths.items()}
         numbers = {"observation.state": poses[view], "action": poses[min(view + 1, N - 1)]}
         counts = {
@@ -212,7 +212,7 @@ def finish_lerobot(out: Path, scenes: Sequence[SceneExport]) -> list[Path]:
     depth = {**picture, "info": {"is_depth_map": True, "depth_unit": "m"}}
     pose = {"dtype": "float32", "shape": [7], "names": POSE}
     number = {"shape": [1], "names": None}
-    info = {
+    info: dict[str, Any] = {
         "codebase_version": "v3.0",
         "robot_type": None,
         "total_episodes": len(scenes),
