@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tofcapture.devices import registry
-from tofcapture.devices.arducam import Arducam
 from tofcapture.devices.registry import StationContext
+from tofcapture.devices.tof.arducam import Arducam
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.testing import check_tof
 

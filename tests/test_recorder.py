@@ -60,6 +60,7 @@ class Bench:
 
 class _Role:
     simulated = True
+    by_hand = fixed = False
     can_turn = False
 
     def __init__(self, bench, role):

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from tofcapture.devices.contract import check_burst, check_points, check_state, check_tof_info
 from tofcapture.devices.kinematics import ArmModel, pose_error
 from tofcapture.devices.registry import lacking
-from tofcapture.errors import ConfigError, MotionRefused, TofError
+from tofcapture.errors import ConfigError, MotionRefused, MotionStopped, TofError
 from tofcapture.frames import ArmInfo, ArmState, StereoInfo, TofInfo, Truth
 from tofcapture.poses import Float64
 
@@ -62,8 +62,11 @@ def check_arm(
     """
     arm = _made(make, "arm")
     _check_describe(arm, ArmInfo)
-    model = _kinematics(arm) if kinematics is None else kinematics
     _refuses(arm.state, TofError, "state() of an arm that is not open raises a TofError")
+    if arm.by_hand:
+        _check_by_hand(arm, prepare)
+        return
+    model = _kinematics(arm) if kinematics is None else kinematics
     with arm as opened:
         prepare(opened)
         _require(opened is arm, "__enter__ returns the device")
@@ -224,6 +227,30 @@ def _check_moves(arm: Any, home: Float64, goal: Float64) -> None:
         _require(off < _NEAR, "move_to returns the measured state, settled at the goal", off)
         now = arm.state()
         _require(np.abs(now.joints - state.joints).max() < _NEAR, "after move_to the arm stays where it is")
+
+
+def _check_by_hand(arm: Any, prepare: Prepare) -> None:
+    """A rig that a person carries: it refuses to move by itself, and stands still while it is checked."""
+    with arm:
+        prepare(arm)
+        first = arm.await_view(0)
+        _keeps(check_state, first)
+        again = arm.await_view(0)
+        _require(
+            again.time_ns > first.time_ns, "await_view() of the same view again, standing still, returns"
+        )
+        _check_state(arm)
+        _refuses(
+            partial(arm.move_to, np.zeros(6)), MotionRefused, "move_to of a rig moved by hand is refused"
+        )
+        arm.stop()
+        stopped = "after stop() await_view raises MotionStopped until resume()"
+        for _ in range(2):
+            _refuses(partial(arm.await_view, 0), MotionStopped, stopped)
+        arm.resume()
+        arm.await_view(0)
+    arm.stop()
+    _refuses(arm.state, TofError, "state() of a closed arm raises a TofError")
 
 
 def _kinematics(arm: Any) -> ArmModel:

@@ -172,7 +172,7 @@ def probe_station(path: str, opening: str = "") -> Iterator[Finding]:
     file = Path(path) if path else None
     try:
         config = read_station(file)
-        workcell = workcell_of(config)
+        workcell = workcell_of(config) if "plan" in config else None
     except TofError as err:
         yield Finding("station", "FAIL", err.message, err.hint)
         return
@@ -186,6 +186,8 @@ def probe_station(path: str, opening: str = "") -> Iterator[Finding]:
     def open_all() -> str:
         with open_station(file) as station:
             state = station.arm.state()
+            if station.arm.by_hand:
+                return "all open; the rig is moved by hand"
             if wrong := pose_error(station.arm.kinematics(), state.joints, state.T_base_flange):
                 raise ConfigError(wrong, hint="correct the kinematics: every check of a way rests on them")
             joints = ", ".join(f"{q:.2f}" for q in state.joints)
@@ -234,6 +236,15 @@ def _probe_arm(context: Any, workcell: Any) -> Iterator[Finding]:
         return  # that has been said
     for caution in arm.cautions():
         yield graded("arm caution", caution, "take the setting out, unless this arm cannot do otherwise")
+
+    if arm.by_hand:
+        return
+    if workcell is None:
+        hint = 'by hand there is none: driver = "manual"'
+        yield Finding(
+            "station", "FAIL", "expected a table [plan] that says where the table and the object stand", hint
+        )
+        return
 
     def home() -> str:
         model = arm_kinematics(arm, context)

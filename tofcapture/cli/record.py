@@ -71,7 +71,7 @@ def _run(args: argparse.Namespace) -> Outcome:
             return _planned(args, scene, station, plan_scene(station, scene, views, args.turns))
         hint = "look at --dry-run, clear the workspace, then add --allow-motion"
         check_motion_allowed(station, args.allow_motion, hint)
-        meter = _BoardMeter(station) if args.calibration else None
+        meter = _BoardMeter(station) if args.calibration and not station.arm.by_hand else None
         with progress() as report:
             tell = partial(report, f"record {scene}")
             result = record(
@@ -123,6 +123,10 @@ def _handed_over(args: argparse.Namespace, scene: str, views: int) -> Outcome | 
 
 def _planned(args: argparse.Namespace, scene: str, station: Station, plan: Plan) -> Outcome:
     """Print the plan, draw it."""
+    if station.arm.by_hand:
+        text = f"{counted(len(plan.views), 'view')}: a person brings the rig to each; nothing moves by itself"
+        data = {"ok": True, "scene": scene, "plan": plan.as_json()}
+        return Outcome(data, "\n".join([text, *plan.shortfall()]))
     from tofcapture.devices.clearance import workcell_of
     from tofcapture.viz.plan import write_plan
 

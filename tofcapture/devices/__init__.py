@@ -60,6 +60,26 @@ class Arm(Device, Protocol):
         """Nothing moves that could hurt anyone. A real arm moves only in a run that allows it."""
         return False
 
+    @property
+    def by_hand(self) -> bool:
+        """A person carries the rig: no motors, no joints (NaN), no plan; the recorder calls ``await_view``."""
+        return False
+
+    @property
+    def fixed(self) -> bool:
+        """The rig stands in one place, as on a tripod; only the object is turned."""
+        return False
+
+    def await_view(self, index: int) -> ArmState:
+        """Return when a person has brought the rig to another view and it stands still; only where ``by_hand``.
+
+        Raises
+        ------
+        MotionStopped
+            Somebody said stop, or nobody did it in time: the view is taken when the scene is asked for again.
+        """
+        raise DeviceError(f"view {index}: this arm moves by itself", hint="call move_to")
+
     def describe(self) -> ArmInfo:
         """Say what this arm is, without opening it."""
         ...
@@ -172,6 +192,10 @@ class Operator(Device, Protocol):
             From how it stood first, counter-clockwise seen from above, radians.
         """
         raise DeviceError(f"nobody can turn {scene!r} by {angle:.2f} rad", hint="record without --turns")
+
+    def tell(self, text: str) -> None:
+        """Tell a person who carries the rig what to do next; nobody need answer."""
+        del text
 
     def truth(self) -> Truth | None:
         """Tell what is exactly true of the view from the present pose; ``None`` in the real world."""

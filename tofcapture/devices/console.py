@@ -58,6 +58,10 @@ class ConsoleOperator(Operator):
         degrees = math.degrees(angle)
         self._wait(f"Turn {scene!r} to {degrees:.0f} deg, counter-clockwise from how it stood first", scene)
 
+    def tell(self, text: str) -> None:
+        """Print, and ring: who carries a rig looks elsewhere."""
+        print(f"\a{text}", file=self._ask or sys.stderr, flush=True)
+
     def _wait(self, request: str, scene: str) -> None:
         """Ask, and return when Enter was pressed."""
         ask, answer = self._ask or sys.stderr, self._answer or sys.stdin

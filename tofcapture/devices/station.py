@@ -122,7 +122,8 @@ def open_station(
         arm.equip(rig)
         for caution in arm.cautions():
             print(f"tofcapture: caution: {caution}", file=sys.stderr, flush=True)
-        devices["arm"] = StationArm(arm, arm_kinematics(arm, context), allowed=allow_motion or arm.simulated)
+        model = None if arm.by_hand else arm_kinematics(arm, context)
+        devices["arm"] = StationArm(arm, model, allowed=allow_motion or arm.simulated)
         station = Station(**devices, rig=rig, config=config)
         try:
             yield station
@@ -137,7 +138,7 @@ class StationArm:
     That holds whatever its driver does. All else is the driver's.
     """
 
-    def __init__(self, arm: Arm, model: ArmModel, *, allowed: bool) -> None:
+    def __init__(self, arm: Arm, model: ArmModel | None, *, allowed: bool) -> None:
         self._arm, self._model, self._allowed = arm, model, allowed
         self._latch = StopLatch()
         self._moves: set[object] = set()  # those that run
@@ -146,7 +147,9 @@ class StationArm:
         return getattr(self._arm, name)
 
     def kinematics(self) -> ArmModel:
-        """Give the arm's geometry: the driver's, or the station's."""
+        """Give the arm's geometry: the driver's, or the station's; ConfigError where a person is the arm."""
+        if self._model is None:
+            raise ConfigError("a rig that is moved by hand has no kinematics")
         return self._model
 
     def move_to(self, joints: Float64) -> ArmState:

@@ -67,7 +67,7 @@ class PlannedView:
     index: int  # rank in the sampling, not in the order of travel
     joints: Float64  # (6,) goal
     T_base_flange: Float64  # (4, 4) nominal pose there
-    distance: float  # from the ToF camera to the target
+    distance: float  # from the ToF camera to the target; NaN, as the next, where a person chooses the place
     direction: Float64  # (3,) unit, from the target to the camera, base frame
     turn: float = 0.0  # of the object about the vertical, counter-clockwise seen from above
 
@@ -75,17 +75,17 @@ class PlannedView:
     def digest(self) -> str:
         """Name the pose of arm and object: a view of another digest is another view."""
         numbers = np.append(self.joints, self.turn) if self.turn else self.joints
+        if np.isnan(self.joints).all():
+            numbers = np.array([self.index, self.turn])  # the place is whoever's choice
         return hashlib.sha256((np.round(numbers, 6) + 0.0).tobytes()).hexdigest()[:16]
 
     def as_json(self) -> dict[str, Any]:
         """Write the view as JSON types."""
-        return {
-            "index": self.index,
-            "joints": self.joints.tolist(),
-            "distance": self.distance,
-            "direction": self.direction.tolist(),
-            "turn_deg": round(float(np.degrees(self.turn)), 6),
-        }
+        turned = {"index": self.index, "turn_deg": round(float(np.degrees(self.turn)), 6)}
+        if np.isnan(self.joints).all():
+            return turned
+        place = {"distance": self.distance, "direction": self.direction.tolist()}
+        return {**turned, "joints": self.joints.tolist(), **place}
 
 
 @dataclass(frozen=True)
@@ -143,10 +143,13 @@ def plan_scene(station: Station, scene: str, views: int, turns: int = 1) -> Plan
     check_scene_name(scene)
     if views < 1:
         raise ConfigError(f"views: expected at least 1, got {views}")
-    workcell, board = workcell_of(station.config), scene == CALIBRATION
+    board = scene == CALIBRATION
     if not 1 <= turns <= (1 if board else _MOST_TURNS):
         limit = "the board stays as it stands" if board else f"expected 1 to {_MOST_TURNS}"
         raise ConfigError(f"turns: {limit}, got {turns}")
+    if station.arm.by_hand:
+        return _by_hand(views, turns, fixed=station.arm.fixed)
+    workcell = workcell_of(station.config)
     digest = hashlib.sha256(f"plan|{station.seed}|{scene}".encode()).digest()
     plan = plan_views(
         station.arm.kinematics(),
@@ -165,6 +168,15 @@ def plan_scene(station: Station, scene: str, views: int, turns: int = 1) -> Plan
             hint="move the target, see [plan] of the station",
         )
     return plan
+
+
+def _by_hand(views: int, turns: int, *, fixed: bool) -> Plan:
+    """Plan views whose places a person chooses; a tripod has one, and so one view for each way in which the object stands."""
+    count = min(views, turns) if fixed else views
+    nowhere, none = np.full(6, np.nan), np.full(3, np.nan)
+    angles = [2 * np.pi * (i * turns // count) / turns for i in range(count)]
+    planned = [PlannedView(i, nowhere, np.eye(4), np.nan, none, angle) for i, angle in enumerate(angles)]
+    return Plan(tuple(planned), views, count, {})
 
 
 def prove(station: Station, plan: Plan) -> list[list[Float64]]:

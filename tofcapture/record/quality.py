@@ -226,7 +226,9 @@ def _against_stereo(phasor: Complex128, info: TofInfo, stereo: StereoFrame, rig:
     for i, own in enumerate(unit):
         spread = [[_spread(each * b) for b in back] for each in (own, own.conj())]
         stated, best = spread[0][i], min(map(min, spread))
-        worse.append(stated / max(best, _SPREAD) if stated > 4 * _SPREAD else 0.0)
+        # Of a flat scene anything agrees with anything.
+        told = stated > 4 * _SPREAD and 2 * best < _spread(own)
+        worse.append(stated / max(best, _SPREAD) if told else 0.0)
     return {"misread": max(worse), "out_of_reach": beyond}
 
 

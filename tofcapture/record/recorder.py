@@ -219,14 +219,29 @@ class _Run:
     def move(self, planned: PlannedView) -> ArmState:
         """Move by a clear way; the arm returns settled."""
         self.begin(planned.index, "moving")
-        arm, workcell = self.station.arm, workcell_of(self.station.config)
-        state = arm.state()
+        arm = self.station.arm
+        if arm.by_hand:
+            return self.await_person(planned)
+        state, workcell = arm.state(), workcell_of(self.station.config)
         way = route(
             arm.kinematics(), self.station.rig, workcell, state.joints, planned.joints, arm.check_move
         )
         for joints in way:
             state = arm.move_to(joints)
             check_state(state)
+        return state
+
+    def await_person(self, planned: PlannedView) -> ArmState:
+        """Wait for the person who carries the rig."""
+        arm, tell, what = (
+            self.station.arm,
+            self.station.operator.tell,
+            f"view {planned.index} of {self.scene!r}",
+        )
+        tell(f"{what}: " + ("wait" if arm.fixed else "bring the rig to another place and hold it still"))
+        state = arm.await_view(planned.index)
+        check_state(state)
+        tell(f"{what}: hold on")
         return state
 
     def expose(self, planned: PlannedView) -> tuple[TofBurst, StereoFrame, ArmState]:
@@ -303,9 +318,7 @@ class _Run:
             "simulated": self.station.simulated,
             "plan": self.plan.digest,
             "pose": planned.digest,
-            "distance": planned.distance,
-            "direction": planned.direction.tolist(),
-            "turn_deg": planned.as_json()["turn_deg"],
+            **{k: v for k, v in planned.as_json().items() if k in ("distance", "direction", "turn_deg")},
             "utc": utc_now(),
         }
 

@@ -123,6 +123,6 @@ def check_motion_allowed(station: Station, allowed: bool, hint: str) -> None:
 
     Raises :class:`MotionRefused`: the arm is real, and ``--allow-motion`` was not given; ``hint`` says what to do.
     """
-    if not (station.simulated or allowed):
+    if not (station.simulated or station.arm.by_hand or allowed):
         model = station.arm.describe().model
         raise MotionRefused(f"the arm {model} is real and --allow-motion was not given", hint=hint)

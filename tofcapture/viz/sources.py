@@ -142,8 +142,12 @@ def near(points: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def links_of(arm: ArmModel | None, joints: Float64) -> Float64 | None:
-    """(7, 3) origins of an arm's links from the base to the flange, metres; ``None`` without a model."""
-    return None if arm is None else np.vstack([np.zeros(3), link_frames(arm, joints)[:, :3, 3]])
+    """(7, 3) origins of an arm's links from the base to the flange, metres; ``None`` without a model, or joints."""
+    return (
+        None
+        if arm is None or np.isnan(joints).any()
+        else np.vstack([np.zeros(3), link_frames(arm, joints)[:, :3, 3]])
+    )
 
 
 def shard_source(path: Path) -> Source:

@@ -34,7 +34,7 @@ from tofcapture.record.stopping import stoppable
 
 if TYPE_CHECKING:
     from tofcapture.devices.station import Station
-    from tofcapture.record.plan import Plan
+    from tofcapture.record.plan import Plan, PlannedView
 
 ALIVE = 0.5  # s between signs of life
 _LAST_WORDS = 2.0  # s that the recorder has to notice that it shall end
@@ -151,8 +151,7 @@ class DaemonLink(Observer):
         views = [
             {
                 "index": v.index,
-                "direction": [round(float(x), 4) for x in v.direction],
-                "distance": round(v.distance, 4),
+                **_place(v),
                 "state": "sealed" if v.index in kept else "planned",
             }
             for v in plan.views
@@ -192,6 +191,13 @@ class DaemonLink(Observer):
         self.tell("failed", index=index, reason=reason)
 
 
+def _place(view: PlannedView) -> dict[str, Any]:
+    """Say where a view is taken from; nothing where a person chooses the place."""
+    if np.isnan(view.distance):
+        return {}
+    return {"direction": view.direction.round(4).tolist(), "distance": round(view.distance, 4)}
+
+
 class PageOperator(Operator):
     """The person at the page, who puts scenes on the table when asked."""
 
@@ -201,6 +207,10 @@ class PageOperator(Operator):
     def place(self, scene: str) -> None:
         """Ask and wait."""
         self._link.ask(scene)
+
+    def tell(self, text: str) -> None:
+        """Show it in the page's log."""
+        self._link.tell("log", text=text)
 
 
 def _work(job: Mapping[str, Any], link: DaemonLink) -> dict[str, Any]:

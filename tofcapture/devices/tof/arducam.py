@@ -163,4 +163,4 @@ def _succeed(code: Any, doing: str) -> None:
         )
 
 
-DRIVERS = {"tof": hosted("tof", "tofcapture.devices.arducam:Arducam")}
+DRIVERS = {"tof": hosted("tof", "tofcapture.devices.tof.arducam:Arducam")}

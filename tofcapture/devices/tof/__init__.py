@@ -1,0 +1,1 @@
+"""Drivers of ToF cameras, a file each."""
