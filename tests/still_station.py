@@ -12,7 +12,7 @@ from tofcapture.devices import StereoDevice, registry
 from tofcapture.devices.by_hand import Tripod
 from tofcapture.devices.console import ConsoleOperator
 from tofcapture.devices.registry import StationContext
-from tofcapture.files.view import find_views, read_view
+from tofcapture.files.view import find_views, open_view
 from tofcapture.frames import StereoFrame, StereoInfo
 from tofcapture.rig import Rig, dumps_rig
 
@@ -65,4 +65,4 @@ def recorded(monkeypatch, folder, camera, tof_table, stereo_table=None, **driver
     ]
     assert main(command) == 0
     assert main(["check", str(out)]) == 0
-    return read_view(find_views(out)["wall"][0])
+    return open_view(find_views(out)["wall"][0])

@@ -22,7 +22,7 @@ from tofcapture.devices.sim.drivers import SimStereo, SimTof
 from tofcapture.devices.sim.world import shared_world
 from tofcapture.devices.station import open_station
 from tofcapture.errors import ConfigError, DeviceError, MotionStopped
-from tofcapture.files.view import find_views, read_view
+from tofcapture.files.view import find_views, open_view
 from tofcapture.poses import exp
 from tofcapture.record.observer import Stopped
 from tofcapture.record.recorder import record
@@ -152,7 +152,7 @@ def test_overshoot_and_tremble_are_waited_for(carried, tmp_path):
     with open_station(path) as station:
         result = record(station, "mug", tmp_path / "rec", views=2, frames=2)
     assert result.recorded == (0, 1), result.reasons
-    views = [read_view(p) for p in find_views(tmp_path / "rec")["mug"]]
+    views = [open_view(p) for p in find_views(tmp_path / "rec")["mug"]]
     for view, pose in zip(views, (at(), at(x=110, z=60, tilt=8)), strict=True):
         seen = np.nanmedian(view.stereo.points[..., 2])
         assert np.isnan(view.arm_before.joints).all()
@@ -210,7 +210,7 @@ def test_a_tripod_takes_one_view_for_each_turn(carried, tmp_path):
     assert person.turns == [0, 90, 180, 270]
     assert alone.recorded == (0,)
     assert "only 1 of 4 views" in alone.plan.shortfall()[0]
-    assert {read_view(p).provenance["turn_deg"] for p in find_views(tmp_path / "rec")["mug"]} == {
+    assert {open_view(p).provenance["turn_deg"] for p in find_views(tmp_path / "rec")["mug"]} == {
         0,
         90,
         180,
