@@ -18,7 +18,7 @@ from tofcapture.cli import EXIT_CODES, GROUPS, all_commands, parser
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("tofcapture", "calibration", "tofcapture_model")
 _HEAVY = (
-    "open3d", "kiss_icp", "cv2", "scipy", "torch", "numba", "matplotlib", "rich", "tomli_w", "jinja2", "safetensors", "small_gicp",
+    "open3d", "kiss_icp", "cv2", "scipy", "torch", "numba", "matplotlib", "tomli_w", "jinja2", "safetensors", "small_gicp",
     "aiohttp", "distributed", "serial", "nxlib", "rerun", "tensorboard", "threadpoolctl", "rtde_control", "rtde_receive", "ArducamDepthCamera",
     "triton",
 )  # fmt: skip

@@ -54,7 +54,7 @@ def test_libraries():
     verdicts = _verdicts(found)
     assert verdicts["h5py"] == "FAIL"
     assert verdicts["numpy"] == verdicts["torch"] == "PASS"
-    assert verdicts["scipy"] == verdicts["rich"] == "WARN"
+    assert verdicts["scipy"] == verdicts["jinja2"] == "WARN"
     assert {f.what: f.advice for f in found}["aiohttp"] == "pip install 'tofcapture[daemon]'"
     assert len(found) == len(verdicts)
     assert any(line.startswith("h5py") for line in requires("tofcapture"))

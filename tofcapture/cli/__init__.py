@@ -24,7 +24,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from tofcapture import __version__
-from tofcapture.cli.kit import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome, at_work
 from tofcapture.errors import ConfigError, PassedOver, TofError, UsageError
 
 GROUP = "tofcapture.commands"
@@ -151,7 +151,8 @@ def _run(argv: Sequence[str]) -> Outcome:
     args = top.parse_args(argv)
     if args.command is None:
         return Outcome(text=top.format_help().rstrip())
-    return _load(entries[args.command]).run(args)
+    with at_work(args.command):
+        return _load(entries[args.command]).run(args)
 
 
 class _Terminated(KeyboardInterrupt):

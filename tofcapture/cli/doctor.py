@@ -24,7 +24,7 @@ from importlib.metadata import requires
 from pathlib import Path
 
 from tofcapture import __version__
-from tofcapture.cli.kit import Command, Outcome
+from tofcapture.cli.kit import Command, Outcome, progress
 from tofcapture.cli.probe import PROBES, Finding, attempt, graded, installed_version, probe
 from tofcapture.cli.setup import bundled_path, describe_weights, station_path
 from tofcapture.errors import ConfigError, TofError
@@ -304,9 +304,12 @@ def _run(args: argparse.Namespace) -> Outcome:
         check_ports,
         check_daemon,
     )
-    with ThreadPoolExecutor(max_workers=len(PROBES)) as pool:
+    with ThreadPoolExecutor(max_workers=len(PROBES)) as pool, progress() as report:
         there = {"station": (station, "open" if args.open else "")}
-        probed = list(pool.map(lambda name: probe(name, *there.get(name, ())), PROBES))
+        looked, probed = pool.map(lambda name: probe(name, *there.get(name, ())), PROBES), []
+        for done, name in enumerate(PROBES):
+            report("looked at", done, len(PROBES), f"{name} comes next")
+            probed.append(next(looked))
     disk = examine(lambda: check_folder(folder))
     groups = [*map(examine, quick), *probed, disk, *map(examine, alone)]
     findings = [finding for group in groups for finding in group]

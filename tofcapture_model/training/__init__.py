@@ -46,6 +46,7 @@ T = TypeVar("T")
 Moments = dict[str, dict[str, Tensor]]  # of an optimiser, by the parameter's name
 SAVE_EVERY = 60.0  # s between resume points
 LOG_EVERY = 20  # steps
+TELL_EVERY = 2.0  # s
 LEAST_SHARE = 0.1  # of a budget in minutes, for each stage
 
 
@@ -223,7 +224,7 @@ class Run:
         self.losses: dict[str, float] = state.pop("losses", {})
         self.position = Position(**state)
         self._log, self._told = Log(None), (0.0, 1.0)  # done and all, of the stage
-        self._started = self._saved = time.monotonic()
+        self._started = self._saved = self._said = time.monotonic()
         self._usual: dict[int, Any] = {}  # what signals did before
         self._asked: int | None = None
 
@@ -254,6 +255,8 @@ class Run:
         """Yield the stage's batches, on the device, from where the run is to its end; validates after epochs."""
         position, training, budget = self.position, self.config.training, self.budget(stage)
         self._started, self._saved = time.monotonic() - position.elapsed, time.monotonic()
+        self._told = (0.0, budget or 0.0)
+        self._tell(stage, "reads its first frames")
         while not self._done(stage):
             keys = epoch_batches(
                 len(data), training.batch, training.seed, position.epoch, self.group.rank, self.group.world
@@ -280,7 +283,11 @@ class Run:
         position = self.position
         position.step, position.batch = position.step + 1, position.batch + 1
         position.elapsed = self.group.slowest(time.monotonic() - self._started)
-        if position.step % LOG_EVERY != 1:
+        due = position.step % LOG_EVERY == 1
+        if not due and time.monotonic() - self._said < TELL_EVERY:
+            return
+        self._tell(stage, f"step {position.step} loss {float(loss.total.detach()):.3f}")
+        if not due:
             return
         self.losses = {k: float(v.detach()) for k, v in {"total": loss.total, **loss.parts}.items()}
         row: dict[str, Any] = {
@@ -289,8 +296,16 @@ class Run:
         if "chamfer" in loss.parts:
             row["winners"] = loss.winners.tolist()
         self._log.write(position.step, row | self.losses)
-        what = stage.name if self.minutes is None else f"{stage.name}, seconds"
-        self.report(what, *self._told, f"step {position.step} loss {self.losses['total']:.3f}")
+
+    def _tell(self, stage: Stage, text: str) -> None:
+        """Say how far the stage is: in seconds of its budget, or in steps."""
+        self._said, (done, total) = time.monotonic(), self._told
+        if (budget := self.budget(stage)) is None:
+            self.report(stage.name, done, total, text)
+        else:
+            self.report(
+                f"{stage.name}, seconds", round(min(self.position.elapsed, budget)), round(budget), text
+            )
 
     def save_now_and_then(self, moments: Moments, *, now: bool = False) -> None:
         """Write the resume point once a minute, or at once: everything that the next step depends on.
