@@ -91,7 +91,7 @@ def main() -> None:
             config = preset(args.preset)
             weights = save_model(Path(folder) / "model.safetensors", build_model(config), config, {})
         model, _, _ = load_checkpoint(weights)
-        ask, _ = torch_model(weights, args.device)
+        ask, *_ = torch_model(weights, args.device)
         decoder = frame_decoder(info, NOMINAL_CAMERA)
         frame = batched(make_frame(raw, info, NOMINAL_CAMERA, decoder=decoder))
         if args.device != "cpu":

@@ -15,6 +15,7 @@ torch = pytest.importorskip("torch")
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+import tofcapture_model
 from tofcapture.camera import Camera
 from tofcapture.cli import main
 from tofcapture.cli.setup import bundled_path
@@ -117,15 +118,22 @@ def test_an_array_and_nothing_else_is_enough(bundled, tmp_path, capsys):
     burst = np.stack([table_top(NOMINAL_CAMERA, seed)[0] for seed in range(4)])
     depth = np.kron(table_top(NOMINAL_CAMERA)[1], np.ones((2, 2)))
     path, errors = saved(tmp_path / "raw.npy", burst), []
-    for flag in ([], ["--average"]):
+    for flag in (["--benchmark"], ["--average"]):
         assert main(["predict", str(path), "--out", str(tmp_path / "out"), *flag, "--json"]) == 0
         answer = json.loads(capsys.readouterr().out)
         assert answer["weights"] == str(bundled)
         assert answer["shape"] == [360, 480]
-        assert min(answer["inference_ms"], answer["decode_ms"]) > 0
+        times = answer["inference_ms"], answer["decode_ms"]
+        assert min(times) > 0 if flag == ["--benchmark"] else times == (None, None)
         errors.append(np.abs(np.load(tmp_path / "out/depth.npy") - depth).mean())
     assert errors[1] < errors[0] < 0.01
-    assert {p.name for p in (tmp_path / "out").iterdir()} >= {"cloud.ply", "depth.png", "normals.png"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} >= {
+        "cloud.ply",
+        "depth.png",
+        "normals.png",
+        "picture.png",
+        "sensor.npy",
+    }
 
 
 def test_no_bundled_weights_is_an_error_that_names_the_option(tmp_path, monkeypatch):
@@ -247,6 +255,76 @@ def test_half_the_mantissa_changes_less_than_noise_does(tmp_path, monkeypatch):
     turned = np.degrees(np.arccos(np.clip((half.normals * single.normals).sum(-1), -1, 1)))
     assert turned.mean() < 0.5
     np.testing.assert_allclose(np.median(half.error / single.error), 1, atol=0.02)
+
+
+def test_a_folder_of_arrays_is_predicted_one_by_one(weights, tmp_path, capsys):
+    """Each has a folder of its own; one that cannot be read is named and stops no other; the network is loaded once."""
+    for k in range(2):
+        saved(tmp_path / f"frame-{k}.npy", table_top(NOMINAL_CAMERA, k)[0])
+    np.savez(tmp_path / "other.npz", raw=table_top(NOMINAL_CAMERA, 2)[0])
+    (tmp_path / "notes.txt").write_text("of no use here")
+    line = ["predict", str(tmp_path), "--weights", str(weights), "--out", str(tmp_path / "out")]
+    assert main(line) == 0
+    said = capsys.readouterr()
+    assert "3 predictions" in said.out
+    assert said.err.count("\n") <= 2
+    alone = predict(tmp_path / "frame-1.npy", tmp_path / "alone", weights=weights)
+    np.testing.assert_array_equal(
+        np.load(tmp_path / "out/frame-1/depth.npy"), np.load(alone["files"]["depth.npy"])
+    )
+    saved(tmp_path / "frame-1.npy", np.zeros((3, 4)))
+    assert main([*line, "--json"]) == 5
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["predictions"].keys() == {"frame-0", "other"}
+    assert "expected numbers of shape" in answer["failed"]["frame-1"]["message"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="expected views, shards or arrays, found none"):
+        predict(tmp_path / "empty", tmp_path / "out", weights=weights)
+
+
+def test_a_network_is_called_with_arrays_and_paths(weights, tmp_path):
+    """``load_model`` is all that one needs; each form gives the same answer, with the sensor's own depth beside it."""
+    raw, depth = table_top(NOMINAL_CAMERA)
+    model = tofcapture_model.load_model(weights)
+    found = [
+        model(raw),
+        model(raw[None]),
+        model(str(saved(tmp_path / "raw.npy", raw))),
+        model(raw[None], frame=None),
+    ]
+    for other in found[1:]:
+        np.testing.assert_array_equal(other.depth, found[0].depth)
+    assert found[0].sensor.shape == raw.shape[1:]
+    assert np.nanmedian(np.abs(found[0].sensor - depth)) < 0.01
+    assert "compact" in repr(model)
+    with pytest.raises(DataError, match="expected numbers of shape"):
+        model(raw[:3])
+
+
+def test_what_a_network_has_not_seen_is_named(tmp_path, capsys):
+    """Other frequencies, another size, another field of view, a darker frame; nothing where all is as in training, or not known."""
+    raw, _ = table_top(NOMINAL_CAMERA)
+    config = replace(preset("demo"), network=replace(preset("demo").network, width=4, levels=2))
+    usual = {
+        "rows": [180, 180], "columns": [240, 240], "field_of_view_deg": [60.0, 70.0],
+        "brightness": [0.01, 0.3], "modulation_hz": [[20e6, 100e6]],
+    }  # fmt: skip
+    path = saved(tmp_path / "raw.npy", raw)
+    for change, word in (
+        ({}, ""),
+        ({"rows": [480, 480]}, "180 rows instead of 480 to 480"),
+        ({"field_of_view_deg": [20.0, 30.0]}, "degrees of view instead of 20 to 30"),
+        ({"brightness": [0.5, 0.9]}, "of saturation in brightness instead of 0.5 to 0.9"),
+        ({"modulation_hz": [[60e6], [20e6, 80e6]]}, "20/100 MHz instead of 60 or 20/80"),
+    ):
+        weights = save_model(
+            tmp_path / "m.safetensors", build_model(config), config, {"seen": usual | change}
+        )
+        assert main(["predict", str(path), "--weights", str(weights), "--out", str(tmp_path / "out")]) == 0
+        said = capsys.readouterr().err
+        assert (word in said) if word else "learned" not in said
+    weights = save_model(tmp_path / "m.safetensors", build_model(config), config, {})
+    assert tofcapture_model.load_model(weights)(raw).outside == ""
 
 
 class Hosts(TorchDispatchMode):

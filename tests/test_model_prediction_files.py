@@ -31,6 +31,7 @@ def written(tmp_path_factory):
         measured=depth > 1,
         camera=CAMERA,
         network="compact",
+        sensor=depth[::2, ::2],
     )
     folder = tmp_path_factory.mktemp("out")
     write_prediction(prediction, folder)

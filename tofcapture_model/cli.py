@@ -114,10 +114,11 @@ def _config(args: argparse.Namespace) -> Config:
 def _train(args: argparse.Namespace) -> Outcome:
     config = _config(args)
     _share_cores()
-    from tofcapture_model.networks.checkpoint import find_model
-    from tofcapture_model.training.train import train
-
     with progress() as report:
+        report("load", 0, 0)
+        from tofcapture_model.networks.checkpoint import find_model
+        from tofcapture_model.training.train import train
+
         done = train(
             config,
             args.dataset[0],
@@ -173,10 +174,11 @@ def _evaluate(args: argparse.Namespace) -> Outcome:
     _share_cores()
     if args.suite:
         return _suite(args)
-    from tofcapture_model.evaluation.evaluate import comparison, evaluate
-
     weights = _one_network(args.weights)
     with progress() as report, _no_going_on():
+        report("load", 0, 0)
+        from tofcapture_model.evaluation.evaluate import comparison, evaluate
+
         results = evaluate(
             args.dataset,
             weights,
@@ -247,11 +249,16 @@ def _configure_predict(parser: argparse.ArgumentParser) -> None:
         "input",
         type=Path,
         metavar="INPUT",
-        help="view file or shard (.h5), or raw (8, H, W) or (F, 8, H, W) (.npy, .npz)",
+        help="view or shard (.h5), raw (K, H, W) or (F, K, H, W) (.npy, .npz), or a recording, a dataset, a folder of such files",
     )
     add("--out", type=Path, default=Path("prediction"), metavar="DIR", help="folder (default: prediction)")
     add("--weights", type=Path, metavar="WEIGHTS", help=_WEIGHTS)
-    add("--view", type=int, default=0, metavar="N", help="of a shard (default: 0)")
+    add(
+        "--view",
+        type=_not_negative,
+        metavar="N",
+        help="only this one of a shard or of every scene (default: all)",
+    )
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--frame", type=int, default=0, metavar="N", help="of the burst (default: 0)")
     which.add_argument("--average", action="store_true", help="take the mean of the burst instead")
@@ -260,38 +267,61 @@ def _configure_predict(parser: argparse.ArgumentParser) -> None:
     add("--saturation", type=_positive, metavar="COUNTS", help=saturation)
     backend = "torch, or onnx: the model.onnx beside the weights (default: torch)"
     add("--backend", choices=("torch", "onnx"), default="torch", metavar="BACKEND", help=backend)
+    add("--benchmark", action="store_true", help="answer ten times and tell the median time")
     _device(parser)
 
 
 def _predict(args: argparse.Namespace) -> Outcome:
     _keep_memory()
-    from tofcapture_model.inference.predict import predict
+    with progress() as report:
+        report("load the network", 0, 0)
+        from tofcapture_model.inference.predict import predict
 
-    result = predict(
-        args.input,
-        args.out,
-        weights=args.weights,
-        view=args.view,
-        frame=None if args.average else args.frame,
-        rig=args.rig,
-        device=_checked_device(args.device),
-        backend=args.backend,
-        saturation=args.saturation,
-    )
-    if result["warning"]:
-        print(f"tofcapture: {result['warning']}", file=sys.stderr)
-    return Outcome(result, _told(result, args.out, args.device), following=f"tofcapture view {args.out}")
+        result = predict(
+            args.input,
+            args.out,
+            weights=args.weights,
+            view=args.view,
+            frame=None if args.average else args.frame,
+            rig=args.rig,
+            device=_checked_device(args.device),
+            backend=args.backend,
+            saturation=args.saturation,
+            benchmark=args.benchmark,
+            report=report,
+        )
+    rows = result.get("predictions", {"": result})
+    for told in dict.fromkeys(w for row in rows.values() for w in (row["warning"], _outside(row)) if w):
+        print(f"tofcapture: {told}", file=sys.stderr)
+    if "predictions" not in result:
+        return Outcome(result, _told(result, args.out, args.device), following=f"tofcapture view {args.out}")
+    lines = [f"{args.out}: {counted(len(rows), 'prediction')}, each in a folder of its own"]
+    lines += [f"FAILED {name}: {error['message']}" for name, error in result["failed"].items()]
+    shown = next(iter(rows), "")
+    following = f"tofcapture view {args.out / shown}"
+    return Outcome(result, "\n".join(lines), 5 if result["failed"] else 0, following)
+
+
+def _outside(row: dict[str, Any]) -> str:
+    if not row["outside"]:
+        return ""
+    return f"the network has not learned from such frames: {row['outside']}. Its answer may be far off; fine-tune it: train --from"
 
 
 def _told(result: dict[str, Any], out: Path, device: str) -> str:
-    """Say in words what was predicted, how fast, and from what."""
+    """Say in words what was predicted, and from what; how fast where that was asked for."""
     size = " x ".join(str(n) for n in reversed(result["shape"]))
     errors = result["median_expected_error"] is not None
     what = "depth, normals and expected error" if errors else "depth and normals"
     timed = "network" if device == "cpu" else "decoding and network"
-    lines = [f"{out}: {what} at {size}, {timed} took {result['inference_ms']:.0f} ms"]
+    took = "" if result["inference_ms"] is None else f", {timed} took {result['inference_ms']:.0f} ms"
+    lines = [f"{out}: {what} at {size}{took}"]
     if not errors:
         lines.append(f"no expected error: {result['network']} predicts none")
+    here, there = result["median_sensor_depth"], result["median_depth"]
+    lines.append(
+        f"median depth {there:.3f} m, of the sensor itself {here:.3f} m; {out}/picture.png shows both"
+    )
     if result["filled"]:
         share = f"{result['measured']:.1%} of the pixels were measured"
         lines.append(f"{share}, the others filled (measured.npy says which)")
@@ -319,7 +349,9 @@ def _export(args: argparse.Namespace) -> Outcome:
     # the bundled weights are no place to write to
     beside = Path("model") if names_bundled(args.weights) else find_model(args.weights)
     out = args.out or beside.with_suffix(SUFFIX[args.format])
-    result = export(args.weights, out, kind=args.format, size=(args.size[0], args.size[1]))
+    with progress() as report:
+        report("export and compare", 0, 0)
+        result = export(args.weights, out, kind=args.format, size=(args.size[0], args.size[1]))
     worst = max(result["differences"].values())
     size = f"{result['bytes'] / 1e6:.1f} MB"
     return Outcome(result, f"{out}: {size}, differs from torch by {worst:.1g} at most")
@@ -339,7 +371,9 @@ def _report(args: argparse.Namespace) -> Outcome:
     _share_cores()
     from tofcapture_model.report import run
 
-    return run(args)
+    with progress() as report:
+        report("draw the report", 0, 0)
+        return run(args)
 
 
 TRAIN = Command(
@@ -355,7 +389,7 @@ EVALUATE = Command(
     _evaluate,
 )
 PREDICT = Command(
-    "estimate depth and normals of one frame",
+    "estimate depth and normals of a frame, or of all views of a folder",
     "tofcapture predict recording/views/mug/view-000.h5 --out prediction",
     _configure_predict,
     _predict,

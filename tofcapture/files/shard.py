@@ -36,6 +36,7 @@ from tofcapture.files.hdf import (
     find,
     json_attr,
     open_checked,
+    open_h5,
     read,
     stereo_from,
     stereo_table,
@@ -148,6 +149,15 @@ def open_shard(path: str | Path) -> ShardReader:
     shard = ShardReader(path)
     shard.scene  # noqa: B018  the whole file is hashed here
     return shard
+
+
+def is_shard(path: Path) -> bool:
+    """Whether a file says that it is a shard; one that cannot be opened says nothing."""
+    try:
+        with open_h5(path) as file:
+            return str(file.attrs.get("format", "")) == "tofcapture-shard"
+    except DataError:
+        return False
 
 
 def scales_text(scales: Sequence[int]) -> str:

@@ -206,10 +206,13 @@ def prediction_source(folder: Path) -> Source:
     try:
         error = folder / "error.npy"  # some networks predict none
         expected = [1e3 * np.load(error, allow_pickle=False)] if error.exists() else []
+        own = folder / "sensor.npy"
+        sensor = [np.load(own, allow_pickle=False)] if own.exists() else []
         points = _ply_points(folder / "cloud.ply")
     except (OSError, ValueError) as err:
         raise _unreadable(folder, err) from err
     panels = [
+        *(Panel("ToF depth", "depth", image) for image in sensor),
         Panel("estimated depth", "depth", depth),
         *(Panel("expected error", "expected", image) for image in expected),
         Panel("estimated normals", "normals", normals),

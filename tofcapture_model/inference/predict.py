@@ -1,9 +1,10 @@
-"""Predict depth, normals and error map of one frame, from a view file, a shard or a plain array; or of many, with :class:`Predictor`."""
+"""Predict depth, normals and error map: of one frame, of all views of a folder, or frame after frame with :class:`Predictor`."""
 
 from __future__ import annotations
 
 import math
 import statistics
+import tempfile
 import time
 from collections.abc import Callable, Hashable
 from pathlib import Path
@@ -14,13 +15,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tofcapture import open_dataset
 from tofcapture.camera import Camera
+from tofcapture.cli.kit import Report
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.disk import check_writable
-from tofcapture.frames import TofInfo
+from tofcapture.files.layout import BOARD_SCENE
+from tofcapture.files.manifest import manifest_path
+from tofcapture.files.shard import ShardReader, is_shard
+from tofcapture.files.view import find_views, view_number
+from tofcapture.frames import TofInfo, View
 from tofcapture.importing.rules import expect_finite
 from tofcapture_model.config import BASELINES
 from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
+from tofcapture_model.data.conditions import Seen, outside
 from tofcapture_model.data.raw_input import RawInput, read_input, taken
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
 from tofcapture_model.geometry.decoder import Taps, TorchDecoder
@@ -50,14 +58,16 @@ class _Prepared(NamedTuple):
 class Predictor:
     """A network that answers frame after frame: loaded once, and on a GPU recorded once per camera.
 
-    Call it with ``raw``, (K, H, W) taps of one frame or a mean that :func:`tofcapture_model.data.raw_input.taken` took; ``info``, the
-    channels, saturation, light source and range errors; ``camera``, intrinsics (``None``: those of ``info``); ``celsius``, NaN: unknown.
-    It answers with a :class:`Prediction` without times, in arrays of its own. Tables and recordings of the last four cameras are kept.
+    Call it with a view, or what :func:`tofcapture_model.data.raw_input.read_input` reads: the path of a view, shard or array; then
+    ``frame`` is that of the burst, or ``None``: the mean. A running camera calls it with ``raw``, (K, H, W) taps of one frame, and
+    ``info``, the channels, saturation, light source and range errors; ``camera``, intrinsics (``None``: those of ``info``);
+    ``celsius``, NaN: unknown. Raw taps without ``info``, (K, H, W) or (F, K, H, W), are checked as an array's file is. It answers with
+    a :class:`Prediction` without times, in arrays of its own. Tables and recordings of the last four cameras are kept.
 
     Parameters
     ----------
     weights
-        Checkpoint or folder of a run; ``None``: the bundled one.
+        Checkpoint or folder of a run; ``None`` or ``bundled``: the bundled one.
     device
         Torch device.
     backend
@@ -71,18 +81,39 @@ class Predictor:
         When called: taps that are not finite, or of a frame in which no pixel measured anything.
     """
 
-    def __init__(self, weights: Path | None = None, device: str = "cpu", backend: str = "torch") -> None:
-        self._ask, self.network = _onnx_model(weights) if backend == "onnx" else torch_model(weights, device)
+    def __init__(
+        self, weights: str | Path | None = None, device: str = "cpu", backend: str = "torch"
+    ) -> None:
+        self.weights = find_model(weights)
+        model = _onnx_model(weights) if backend == "onnx" else torch_model(weights, device)
+        self._ask, self.network, self._seen = model
         self._device = torch.device("cpu" if backend == "onnx" else device)
         self._prepared: dict[Hashable, _Prepared] = {}
         if self._on_gpu:
             torch.cuda.set_device(self._device)  # streams, graphs and waiting are the current one's
 
     def __call__(
-        self, raw: NDArray[Any], info: TofInfo, camera: Camera | None = None, celsius: float = math.nan
+        self,
+        raw: View | str | Path | NDArray[Any],
+        info: TofInfo | None = None,
+        camera: Camera | None = None,
+        celsius: float = math.nan,
+        *,
+        frame: int | None = 0,
     ) -> Prediction:
         """Answer for one frame."""
+        if info is None or not isinstance(raw, np.ndarray):
+            return self.answer(_input_of(raw, frame), frame)
         return self._answer(raw, info, camera or info.camera, celsius, "raw frame", _untimed)
+
+    def __repr__(self) -> str:
+        return f"Predictor({self.network}, {str(self.weights)!r}, on {self._device})"
+
+    def answer(self, data: RawInput, frame: int | None = 0, *, timed: bool = False) -> Prediction:
+        """Answer for one frame of a burst that was read, or with ``None`` for its mean; ``timed`` tells how long that takes."""
+        raw, celsius = taken(data.raw, frame, data.info, data.celsius)
+        watch = _timed if timed else _untimed
+        return self._answer(raw, data.info, data.camera, celsius, data.named(frame) or "raw frame", watch)
 
     @property
     def _on_gpu(self) -> bool:
@@ -96,8 +127,9 @@ class Predictor:
         with torch.inference_mode():
             prepared = self._prepare(info, camera)
             inputs, decode_ms = watch(lambda: prepared.prepare(raw, celsius), wait)
-            (depth, normals, error, valid), inference_ms = watch(lambda: prepared.ask(inputs), wait)
-        measured = _image(valid)[0] > 0
+            (depth, normals, error, *mine), inference_ms = watch(lambda: prepared.ask(inputs), wait)
+        valid, sensor, confidence = (_image(x)[0] for x in mine)
+        measured = valid > 0
         if not measured.any():
             raise _nothing(raw, info, where)
         return Prediction(
@@ -107,6 +139,10 @@ class Predictor:
             measured=measured.repeat(2, axis=0).repeat(2, axis=1),
             camera=camera.scaled(2),
             network=self.network,
+            sensor=np.where(measured, sensor, np.float32(np.nan)),
+            outside=outside(
+                self._seen, tuple(info.modulation_hz), camera, float(np.median(confidence[measured]))
+            ),
             inference_ms=inference_ms,
             decode_ms=decode_ms,
         )
@@ -129,7 +165,7 @@ class Predictor:
         decoder = frame_decoder(info, camera)
 
         def ask(frame: Frame) -> tuple[Tensor, ...]:
-            return *self._ask(frame), frame.valid
+            return *self._ask(frame), frame.valid, frame.depth, frame.confidence
 
         return _Prepared(lambda raw, celsius: batched(make_frame(raw, info, camera, celsius, decoder)), ask)
 
@@ -139,7 +175,7 @@ class Predictor:
 
         def ask(taps: Taps) -> tuple[Tensor, ...]:
             frame = with_cues(decoder(taps), high)
-            return *self._ask(frame), frame.valid
+            return *self._ask(frame), frame.valid, frame.depth, frame.confidence
 
         dark = np.zeros((len(info.modulation_hz), *camera.shape), np.float32)
         return _Prepared(decoder.taps, recorded(ask, decoder.taps(dark, math.nan)))
@@ -173,10 +209,20 @@ def predict_raw(
 
     ``timed`` decodes and asks ten times, and tells how long it takes.
     """
-    raw, celsius = taken(data.raw, frame, data.info, data.celsius)
-    predictor = Predictor(weights, device, backend)
-    watch = _timed if timed else _untimed
-    return predictor._answer(raw, data.info, data.camera, celsius, data.named(frame) or "raw frame", watch)  # noqa: SLF001
+    return Predictor(weights, device, backend).answer(data, frame, timed=timed)
+
+
+def _input_of(source: View | str | Path | NDArray[Any], frame: int | None) -> RawInput:
+    """Make a burst of whatever one calls a network with."""
+    if isinstance(source, View):
+        name = f"{source.scene} {source.index}"
+        return RawInput(source.tof.raw, source.tof.celsius, source.tof.info, source.rig.tof, name)
+    if isinstance(source, np.ndarray):
+        with tempfile.TemporaryDirectory() as folder:  # one reader checks all arrays
+            path = Path(folder) / "array.npy"
+            np.save(path, source)
+            return read_input(path, frame=frame)
+    return read_input(Path(source), frame=frame)
 
 
 def _untimed(work: Callable[[], T], _wait: Callable[[], None]) -> tuple[T, float]:
@@ -236,9 +282,12 @@ def recorded(
     return replay
 
 
-def torch_model(weights: Path | None, device: str) -> tuple[Ask, str]:
-    """Load a network to compute as it was trained: in bfloat16 if that is how it learned, and where the device has it. With its kind."""
-    model, config, _ = load_checkpoint(weights)
+def torch_model(weights: str | Path | None, device: str) -> tuple[Ask, str, Seen | None]:
+    """Load a network to compute as it was trained: in bfloat16 if that is how it learned, and where the device has it.
+
+    With its kind, and what its checkpoint says that it has seen.
+    """
+    model, config, provenance = load_checkpoint(weights)
     model = model.to(device)
     kind = torch.device(device).type
     half = config.training.precision == "bfloat16" and has_bfloat16(kind)
@@ -251,7 +300,7 @@ def torch_model(weights: Path | None, device: str) -> tuple[Ask, str]:
             found = model(frame)
         return found.depth, found.normals, found.error
 
-    return ask, config.network.kind
+    return ask, config.network.kind, provenance.get("seen")
 
 
 def _halve_convolutions(model: JointModel) -> None:
@@ -271,7 +320,7 @@ def has_bfloat16(kind: str) -> bool:
     )
 
 
-def _onnx_model(weights: Path | None) -> tuple[Ask, str]:
+def _onnx_model(weights: str | Path | None) -> tuple[Ask, str, Seen | None]:
     from tofcapture_model.inference.export import ask_onnx, config_of, open_onnx
 
     named = find_model(weights)  # a checkpoint, or the export itself
@@ -293,7 +342,7 @@ def _onnx_model(weights: Path | None) -> tuple[Ask, str]:
         depth, normals, error = (torch.from_numpy(x) for x in ask_onnx(session, frame))
         return depth, normals, error
 
-    return ask, config.network.kind
+    return ask, config.network.kind, None
 
 
 def _expect_folder(out: Path) -> None:
@@ -306,39 +355,150 @@ def _expect_folder(out: Path) -> None:
     check_writable(out, "name another folder: --out")
 
 
+class Source(NamedTuple):
+    """Name of a burst among others, its file, and its view where that is a shard."""
+
+    name: str
+    path: Path
+    view: int = 0
+
+
+def sources_of(path: Path, view: int | None = None) -> list[Source]:
+    """List the bursts that a path stands for.
+
+    Parameters
+    ----------
+    path
+        View, shard, array, recording (without the board's views), dataset, or a folder of views, shards and arrays.
+    view
+        Of every scene only the one of this number; of a shard the one at this place.
+
+    Raises
+    ------
+    DataError
+        Nothing is there to predict from.
+    """
+    if path.is_dir():
+        found = [source for file in _files_in(path) for source in _of_file(file, view)]
+    else:
+        found = _of_file(path, view)
+    if not found:
+        raise DataError(
+            f"{path}: expected views, shards or arrays, found none"
+            + ("" if view is None else f" of view {view}"),
+            hint="a recording, a dataset, a folder of .npy, .npz or .h5 files, or one such file",
+        )
+    stems = [source.name for source in found]
+    return [
+        source if stems.count(source.name) == 1 else source._replace(name=f"{source.path.name}-{i}")
+        for i, source in enumerate(found)
+    ]
+
+
+def _files_in(folder: Path) -> list[Path]:
+    if manifest_path(folder).exists():
+        return [shard.path for shard in open_dataset(folder).shards.values()]
+    if (folder / "views").is_dir():
+        scenes = find_views(folder)
+        return [path for scene, paths in scenes.items() if scene != BOARD_SCENE for path in paths]
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in {".npy", ".npz", ".h5"} and p.is_file())
+
+
+def _of_file(path: Path, view: int | None) -> list[Source]:
+    if path.suffix.lower() != ".h5" or not is_shard(path):
+        number = view_number(path)
+        fits = view is None or number is None or number == view
+        return (
+            [Source(path.stem if number is None else f"{path.parent.name}-{number:03d}", path)]
+            if fits
+            else []
+        )
+    with ShardReader(path) as shard:
+        if view is not None and not 0 <= view < len(shard):
+            raise ConfigError(f"{path}: expected a view of 0 to {len(shard) - 1}, got {view}")
+        views = range(len(shard)) if view is None else [view]
+        return [Source(f"{shard.scene}-{shard.index(i):03d}", path, i) for i in views]
+
+
 def predict(
-    path: Path,
-    out: Path,
+    path: str | Path,
+    out: str | Path,
     *,
-    weights: Path | None = None,
-    view: int = 0,
+    weights: str | Path | None = None,
+    view: int | None = None,
     frame: int | None = 0,
     rig: Path | None = None,
     device: str = "cpu",
     backend: str = "torch",
     saturation: float | None = None,
+    benchmark: bool = False,
+    report: Report = lambda _what, _done, _total, _text="": None,
 ) -> dict[str, Any]:
-    """Predict from a file and write the result; returns what ``--json`` prints."""
+    """Predict from one burst into ``out``, or from many into a folder of it each; returns what ``--json`` prints.
+
+    Parameters
+    ----------
+    path, view
+        As for :func:`sources_of`.
+    out
+        Folder, made when missing.
+    weights, device, backend
+        As for :class:`Predictor`.
+    frame
+        Of each burst, or ``None``: the mean.
+    rig, saturation
+        Of arrays.
+    benchmark
+        Answer ten times and tell the median time.
+    report
+        Told how far it is.
+
+    Raises
+    ------
+    DataError, ConfigError
+        As :func:`tofcapture_model.data.raw_input.read_input` does. Of many bursts one that cannot be read stops no other: it stands
+        under ``failed``.
+    """
     _expect_folder(Path(out))
-    data = read_input(Path(path), view, rig, saturation=saturation, frame=frame)
-    prediction = predict_raw(data, frame, weights, device, backend, timed=True)
-    written = write_prediction(prediction, Path(out))
-    used = find_model(weights)
-    share = float(prediction.measured.mean())
-    error = prediction.error
+    sources = sources_of(Path(path), view)
+    many = len(sources) > 1
+    report("load the network", 0, 0)
+    predictor = Predictor(weights, device, backend)
+    rows: dict[str, dict[str, Any]] = {}
+    failed: dict[str, dict[str, str]] = {}
+    for done, source in enumerate(sources):
+        report("predict", done, len(sources) if many else 0, source.name)
+        try:
+            data = read_input(source.path, source.view, rig, saturation=saturation, frame=frame)
+            prediction = predictor.answer(data, frame, timed=benchmark)
+        except DataError as err:
+            if not many:
+                raise
+            failed[source.name] = {"message": err.message, "hint": err.hint}
+            continue
+        written = write_prediction(prediction, Path(out) / source.name if many else Path(out))
+        rows[source.name] = _row(data, prediction, written)
+    if many:
+        report("predict", len(sources), len(sources))
+    weights_used = predictor.weights.with_suffix(".onnx") if backend == "onnx" else predictor.weights
+    about = {"input": str(path), "network": predictor.network, "weights": str(weights_used), "units": "m"}
+    return about | ({"predictions": rows, "failed": failed} if many else next(iter(rows.values())))
+
+
+def _row(data: RawInput, prediction: Prediction, written: dict[str, str]) -> dict[str, Any]:
+    """Say of a prediction what it rests on, and its main numbers."""
+    share, error = float(prediction.measured.mean()), prediction.error
+    times = {"inference_ms": prediction.inference_ms, "decode_ms": prediction.decode_ms}
     return {
-        "input": str(path),
         "assumed": data.assumed,
         "warning": data.warning,
+        "outside": prediction.outside,
         "measured": round(share, 4),
         "filled": round(1 - share, 4),
-        "network": prediction.network,
-        "weights": str(used.with_suffix(".onnx") if backend == "onnx" else used),
-        "inference_ms": round(prediction.inference_ms, 2),
-        "decode_ms": round(prediction.decode_ms, 2),
+        **{name: None if math.isnan(ms) else round(ms, 2) for name, ms in times.items()},
         "shape": list(prediction.depth.shape),
         "median_depth": float(np.median(prediction.depth)),
+        "median_sensor_depth": float(np.nanmedian(prediction.sensor)),
         "median_expected_error": None if error is None else float(np.median(error)),
-        "units": "m",
         "files": written,
     }

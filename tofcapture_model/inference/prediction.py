@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.colours import png_bytes
+from tofcapture.colours import paint_normals, png_bytes, scale_for
 from tofcapture.files.disk import full_disk_named
 from tofcapture.files.seal import replacing, write_text
 
@@ -37,6 +37,10 @@ class Prediction:
         Intrinsics of the (2H, 2W) grid.
     network
         Kind of network that answered.
+    sensor
+        (H, W) float32 metres: the sensor's own depth of the same frame; NaN: none.
+    outside
+        What of the camera or the light the network has not seen in training, in words; empty: nothing, as far as it is known.
     inference_ms
         Median time of the network, after loading and decoding; on a GPU with that of decoding and of the physical cues; NaN: not timed.
     decode_ms
@@ -50,6 +54,8 @@ class Prediction:
     measured: NDArray[np.bool_]
     camera: Camera
     network: str
+    sensor: Float32
+    outside: str = ""
     inference_ms: float = math.nan
     decode_ms: float = math.nan
 
@@ -74,12 +80,21 @@ def ply_bytes(prediction: Prediction) -> bytes:
     return "\n".join(header).encode() + rows.astype("<f4").tobytes()
 
 
+def side_by_side(prediction: Prediction) -> tuple[NDArray[np.uint8], str]:
+    """Paint the sensor's depth, the network's and its normals: (2H, 6W, 3) colours, and the scale of depth in words."""
+    sensor = prediction.sensor.repeat(2, axis=0).repeat(2, axis=1)
+    scale = scale_for("depth", [prediction.depth, sensor])
+    images = scale.paint(sensor), scale.paint(prediction.depth), paint_normals(prediction.normals)
+    return np.concatenate(images, axis=1), scale.words
+
+
 def write_prediction(prediction: Prediction, out: Path) -> dict[str, str]:
     """Write a prediction into a folder.
 
     ``depth.npy``, ``error.npy`` (float32 metres), ``normals.npy``, ``measured.npy`` (bool), ``cloud.ply``, ``depth.png`` (16 bit,
-    unit 0.1 mm, so up to 6.5535 m), ``normals.png`` (8 bit, ``(n + 1) / 2`` with y and z towards the viewer), ``units.txt``. From a
-    network that predicts no error there is no ``error.npy``; one of an earlier prediction is removed.
+    unit 0.1 mm, so up to 6.5535 m), ``normals.png`` (8 bit, ``(n + 1) / 2`` with y and z towards the viewer), ``sensor.npy`` (the
+    sensor's own depth, float32 metres, NaN: none), ``picture.png`` (the sensor's depth, the network's in the same colours, normals),
+    ``units.txt``. From a network that predicts no error there is no ``error.npy``; one of an earlier prediction is removed.
 
     Returns
     -------
@@ -99,15 +114,16 @@ def _write(prediction: Prediction, out: Path) -> dict[str, str]:
     (out / "error.npy").unlink(missing_ok=True)
     arrays = {
         f"{name}.npy": array
-        for name in ("depth", "normals", "error", "measured")
+        for name in ("depth", "normals", "error", "measured", "sensor")
         if (array := getattr(prediction, name)) is not None
     }
     tenth_mm = np.clip(np.rint(prediction.depth * 1e4), 0, 65535).astype(np.uint16)
-    colours = ((prediction.normals * [1, -1, -1] + 1) * 127.5).clip(0, 255).astype(np.uint8)
+    picture, scale = side_by_side(prediction)
     made = {name: _npy_bytes(array) for name, array in arrays.items()}
     made |= {
         "depth.png": png_bytes(tenth_mm),
-        "normals.png": png_bytes(colours),
+        "normals.png": png_bytes(paint_normals(prediction.normals)),
+        "picture.png": png_bytes(picture, {"depth": scale}),
         "cloud.ply": ply_bytes(prediction),
     }
     for name, data in made.items():
@@ -117,7 +133,8 @@ def _write(prediction: Prediction, out: Path) -> dict[str, str]:
         out / "units.txt",
         "npy, ply: metres, ToF frame (x right, y down, z forward)\n"
         "measured.npy: bool, true where the depth stands on a measurement, false where the sensor had none and it was filled\n"
-        "depth.png: 0.1 mm per count\n",
+        "sensor.npy: metres, the sensor's own depth of the frame at its own resolution, NaN where it had none\n"
+        "depth.png: 0.1 mm per count\n"
+        f"picture.png: the sensor's depth, the network's depth, both {scale} from violet to yellow, and its normals\n",
     )
-    names = (*arrays, "depth.png", "normals.png", "cloud.ply", "units.txt")
-    return {name: str(out / name) for name in names}
+    return {name: str(out / name) for name in (*made, "units.txt")}

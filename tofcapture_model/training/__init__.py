@@ -415,6 +415,8 @@ def source_of(model: Model, config: Config, datasets: Sequence[Path], start: Pat
         source["also"] = {str(d): _digest(d) for d in also}
     if known is None or "learned" in known:
         source["learned"] = learned_from(datasets, (known or {}).get("learned"))
+    if known and "seen" in known:
+        source["seen"] = known["seen"]
     return source
 
 

@@ -18,6 +18,7 @@ from tofcapture.files.manifest import load_manifest
 from tofcapture_model.config import Config, Stage, preset
 from tofcapture_model.data import FrameDataset, spare_memory
 from tofcapture_model.data.augment import BurstNoise, redraw_calibration, redraw_frame
+from tofcapture_model.data.conditions import seen_by
 from tofcapture_model.evaluation.evaluate import calibrate
 from tofcapture_model.frame import Estimate, Frame
 from tofcapture_model.losses import Objective
@@ -116,6 +117,10 @@ def train(
             mean=training.noise == "drawn", cache_bytes=0 if workers else spare_memory(), cache=None if cache is None else Path(cache),
         )  # fmt: skip
         with closing(data), run:
+            if source.get("start") is None or source.get(
+                "seen"
+            ):  # else nobody knows what the first weights had seen
+                source["seen"] = seen_by(data, source.get("seen"))
             for stage in config.stages[run.position.stage :]:
                 learner = Learner(model, config, stage, group, run.moments)
                 for frame, target in run.batches(data, stage, workers):
