@@ -147,7 +147,7 @@ class _Voice:
         self._speaking.append(self)
         self._usual = sys.stdout, sys.stderr
         if self._live and len(self._speaking) == 1 and "ipykernel" not in sys.modules:
-            sys.stdout, sys.stderr = (_Aside(s) if s.isatty() else s for s in self._usual)  # type: ignore[assignment]
+            sys.stdout, sys.stderr = (_Aside(s) if s.isatty() else s for s in self._usual)
         threading.Thread(target=self._beat, daemon=True).start()
         return self
 
