@@ -7,7 +7,7 @@ import io
 import tomllib
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -171,10 +171,8 @@ class Rig:
 
 def camera_from(table: Mapping[str, Any], where: str) -> Camera:
     """Read a camera's table; :class:`ConfigError` names what is missing."""
-    known = {"width", "height", "fx", "fy", "cx", "cy"}
-    missing = known - table.keys()
-    if missing:
-        raise ConfigError(f"{where}: missing {', '.join(sorted(missing))}")
+    if missing := [k for k in _CAMERA if k not in table]:
+        raise ConfigError(f"{where}: missing {', '.join(missing)}")
     fx, fy, cx, cy = (float(table[k]) for k in ("fx", "fy", "cx", "cy"))
     lens = table.get("distortion", ())
     if isinstance(lens, Mapping):
@@ -237,8 +235,8 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
     }
 
 
-def loads_rig(text: str, where: str = "rig") -> Rig:
-    """Read the text of a ``rig.toml``.
+def loads_rig(text: str, where: str = "rig", *, tof_only: bool = False) -> Rig:
+    """Read the text of a ``rig.toml``; where ``tof_only`` is enough, what is missing besides ``[tof]`` is neutral.
 
     Raises :class:`ConfigError`: not TOML, unknown or missing keys, units other than metres, transforms that are not rigid.
     """
@@ -246,24 +244,46 @@ def loads_rig(text: str, where: str = "rig") -> Rig:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as err:
         raise ConfigError(f"{where}: not TOML: {err}") from err
-    needed = {"tof", "stereo", "T_tof_stereo", "T_flange_tof"}
-    if unknown := table.keys() - needed - {"format", "version", "units", "range_error"}:
+    if unknown := table.keys() - {*_NEEDED, "format", "version", "units", "range_error"}:
         hint = "see docs/formats.md, rig.toml"
         raise ConfigError(f"{where}: unknown key {', '.join(sorted(unknown))}", hint)
-    if table.get("units") != "m":
+    if table.get("units", "m" if tof_only else None) != "m":
         raise ConfigError(f'{where}: expected units = "m", got {table.get("units")!r}')
-    if missing := needed - table.keys():
-        raise ConfigError(f"{where}: missing {', '.join(sorted(missing))}")
+    if missing := _missing(table, ("tof",) if tof_only else _NEEDED):
+        hint = "tofcapture rig init --camera fx,fy,cx,cy --size H,W writes [tof]"
+        hint += (
+            ""
+            if missing[0].startswith("[tof]")
+            else ", which predict needs alone; tofcapture align measures the rest"
+        )
+        raise ConfigError(f"{where}: missing {', '.join(missing)}", hint)
+    tof = camera_from(table["tof"], f"{where}: [tof]")
+    neutral = replace(tof, distortion=())
     errors: Sequence[Mapping[str, Any]] = table.get("range_error", [])
     return Rig(
-        tof=camera_from(table["tof"], f"{where}: [tof]"),
-        stereo=camera_from(table["stereo"], f"{where}: [stereo]"),
-        T_tof_stereo=check_transform(table["T_tof_stereo"], f"{where}: T_tof_stereo"),
-        T_flange_tof=check_transform(table["T_flange_tof"], f"{where}: T_flange_tof"),
+        tof=tof,
+        stereo=camera_from(table["stereo"], f"{where}: [stereo]") if "stereo" in table else neutral,
+        T_tof_stereo=check_transform(table.get("T_tof_stereo", np.eye(4)), f"{where}: T_tof_stereo"),
+        T_flange_tof=check_transform(table.get("T_flange_tof", np.eye(4)), f"{where}: T_flange_tof"),
         illuminator=np.asarray(table["tof"].get("illuminator", [0, 0, 0]), dtype=np.float64),
         range_errors=tuple(range_error_from(e) for e in errors),
         reach=parse_reach(table["tof"].get("reach"), f"{where}: [tof]"),
     )
+
+
+_CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
+_NEEDED = ("tof", "stereo", "T_tof_stereo", "T_flange_tof")
+
+
+def _missing(table: Mapping[str, Any], needed: Sequence[str]) -> list[str]:
+    """Name everything that a rig lacks, keys of its cameras included."""
+    out = list[str]()
+    for name in needed:
+        if name not in table:
+            out.append(f"[{name}] {', '.join(_CAMERA)}" if name in {"tof", "stereo"} else name)
+        elif isinstance(table[name], Mapping) and (lacks := [k for k in _CAMERA if k not in table[name]]):
+            out.append(f"[{name}] {', '.join(lacks)}")
+    return out
 
 
 def dumps_rig(rig: Rig) -> str:
@@ -273,8 +293,8 @@ def dumps_rig(rig: Rig) -> str:
     return str(tomli_w.dumps(rig_to_dict(rig)))
 
 
-def load_rig(path: str | Path) -> Rig:
-    """Read ``rig.toml``.
+def load_rig(path: str | Path, *, tof_only: bool = False) -> Rig:
+    """Read ``rig.toml``; where ``tof_only`` is enough, what is missing besides ``[tof]`` is neutral.
 
     Raises :class:`ConfigError`: missing, not TOML, or not a rig.
     """
@@ -283,4 +303,4 @@ def load_rig(path: str | Path) -> Rig:
     except (OSError, UnicodeDecodeError) as err:
         hint = "tofcapture align RECORDING writes one"
         raise ConfigError(f"{path}: cannot read the rig: {err}", hint) from err
-    return loads_rig(text, str(path))
+    return loads_rig(text, str(path), tof_only=tof_only)

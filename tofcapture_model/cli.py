@@ -262,7 +262,12 @@ def _configure_predict(parser: argparse.ArgumentParser) -> None:
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--frame", type=int, default=0, metavar="N", help="of the burst (default: 0)")
     which.add_argument("--average", action="store_true", help="take the mean of the burst instead")
-    add("--rig", type=Path, metavar="RIG.toml", help="rig for an array (default: nominal intrinsics)")
+    add(
+        "--rig",
+        type=Path,
+        metavar="RIG.toml",
+        help="rig or camera of an array: RIG.toml, fx,fy,cx,cy or a file (default: nominal)",
+    )
     saturation = "at which the sensor of an array saturates (default: 4095, 12 bits)"
     add("--saturation", type=_positive, metavar="COUNTS", help=saturation)
     backend = "torch, or onnx: the model.onnx beside the weights (default: torch)"

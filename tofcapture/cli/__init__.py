@@ -33,7 +33,7 @@ DESCRIPTION = "Capture paired ToF raw data and stereo ground truth on a robot ar
 GROUPS = {
     "begin": ("demo", "doctor", "config", "completion"),
     "record": ("record", "daemon", "status", "stop", "import", "simulate", "simulate-dataset"),
-    "calibrate": ("align", "calibrate"),
+    "calibrate": ("align", "calibrate", "rig"),
     "datasets": ("build-dataset", "check", "stats", "view", "figure", "pack", "export-dataset"),
     "network": ("train", "evaluate", "predict", "export", "report"),
 }

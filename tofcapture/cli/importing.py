@@ -1,4 +1,4 @@
-"""``tofcapture import``: data that others took, to a recording."""
+"""``tofcapture import``: data that others took, to a recording. ``tofcapture rig``: constants of a rig."""
 
 from __future__ import annotations
 
@@ -107,9 +107,93 @@ def _run(args: argparse.Namespace) -> Outcome:
     return Outcome(data, "\n".join(lines), following=f"tofcapture build-dataset {args.out} --out dataset")
 
 
-COMMAND = Command(
+_CAMERA = "fx,fy,cx,cy[,k1,k2,p1,p2,k3], or a file of Kalibr, ROS, OpenCV or COLMAP"
+
+
+def _configure_rig(parser: argparse.ArgumentParser) -> None:
+    subs = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
+    out = {
+        "type": Path,
+        "default": Path("rig.toml"),
+        "metavar": "RIG.toml",
+        "help": "file to write (default: rig.toml)",
+    }
+    size = {"metavar": "H,W", "help": "image size, where the camera does not say it"}
+    for name, text in (
+        ("init", "write the rig of a ToF camera"),
+        ("convert", "write a rig from another tool's camera"),
+    ):
+        sub = subs.add_parser(name, help=text, description=text)
+        if name == "init":
+            sub.add_argument("--camera", required=True, metavar="CAMERA", help=_CAMERA)
+        else:
+            sub.add_argument("camera", metavar="CAMERA", help=_CAMERA)
+        sub.add_argument("--size", **size)
+        sub.add_argument("--out", **out)
+    show = subs.add_parser("show", help="say what a rig holds", description="say what a rig holds")
+    show.add_argument("camera", metavar="CAMERA", help=f"rig.toml, {_CAMERA}")
+    show.add_argument("--size", **size)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    try:
+        height, width = (int(n) for n in text.split(","))
+    except ValueError as err:
+        raise ConfigError(f"--size: expected H,W such as 180,240, got {text!r}") from err
+    return height, width
+
+
+def _run_rig(args: argparse.Namespace) -> Outcome:
+    import numpy as np
+
+    from tofcapture.files.seal import write_text
+    from tofcapture.importing.rigs import tof_rig
+    from tofcapture.rig import dumps_rig, rig_to_dict
+
+    rig = tof_rig(args.camera, _size(args.size))
+    if args.what != "show":
+        if args.out.exists():
+            raise ConfigError(f"{args.out}: is there already", hint="name another file: --out")
+        write_text(args.out, dumps_rig(rig))
+    rows = []
+    for name, c in (("tof", rig.tof), ("stereo", rig.stereo)):
+        angles = [2 * np.degrees(np.arctan(n / 2 / f)) for n, f in ((c.width, c.fx), (c.height, c.fy))]
+        numbers = [f"{x:.2f}" for x in (c.fx, c.fy, c.cx, c.cy)]
+        rows.append(
+            (
+                name,
+                f"{c.width} x {c.height}",
+                *numbers,
+                f"{angles[0]:.1f} x {angles[1]:.1f}",
+                len(c.distortion),
+            )
+        )
+    head = ("camera", "pixels", "fx", "fy", "cx", "cy", "view deg", "lens terms")
+    lines = [table(head, rows)]
+    for name, T in (("T_tof_stereo", rig.T_tof_stereo), ("T_flange_tof", rig.T_flange_tof)):
+        place = " ".join(f"{1e3 * x:.1f}" for x in T[:3, 3])
+        lines.append(f"{name}: identity" if np.array_equal(T, np.eye(4)) else f"{name}: at {place} mm")
+    lines += [
+        f"range error at {e.modulation_hz / 1e6:g} MHz: offset {1e3 * e.offset:.1f} mm"
+        for e in rig.range_errors
+    ]
+    if args.what != "show":
+        lines.append(str(args.out))
+    return Outcome(rig_to_dict(rig), "\n".join(lines))
+
+
+IMPORT = Command(
     help="turn data that others took into a recording",
     example="tofcapture import mydata --camera 190.6,200.8,116.8,101.5 --out recordings/mine",
     configure=_configure,
     run=_run,
+)
+
+RIG = Command(
+    help="write, show and convert the constants of a rig",
+    example="tofcapture rig init --camera 190.6,200.8,116.8,101.5 --size 180,240",
+    configure=_configure_rig,
+    run=_run_rig,
 )

@@ -25,6 +25,8 @@ __all__ = ["Problem", "check"]
 
 Tell = Callable[[Path], None]
 Scenes = Mapping[str, SceneEntry]
+UNFINISHED = "importing"
+"""Folder of a recording in which scenes are imported; they lie among the views once they are whole."""
 _AGAIN = "run build-dataset again"
 _BESIDE = ("README", "LICENSE", "LICENCE", "CITATION", "CHANGELOG", "NOTICE")
 _SEALED = "SELECT scene, \"index\", sha256 FROM views WHERE state = 'sealed'"
@@ -51,7 +53,8 @@ def check(path: Path, progress: Tell | None = None) -> list[Problem]:
 
 
 def _check_folder(path: Path, tell: Tell) -> Iterator[Problem]:
-    recording, dataset = (path / "views").is_dir(), manifest_path(path).exists() or (path / "shards").is_dir()
+    recording = (path / "views").is_dir() or (path / UNFINISHED).is_dir()
+    dataset = manifest_path(path).exists() or (path / "shards").is_dir()
     if recording:
         yield from _check_recording(path, tell)
     if dataset:
@@ -80,6 +83,10 @@ def _check_recording(path: Path, tell: Tell) -> Iterator[Problem]:
     for scene, name in sorted(promised):
         yield Problem(
             path / "views" / scene / name, "", "sealed in the journal, but not there", "record again"
+        )
+    for left in sorted((path / UNFINISHED).glob("*")):
+        yield Problem(
+            left, "", "an import of this scene was not finished", "run the same import again, or delete it"
         )
     readers: dict[str, Callable[[Path], Any]] = {"rig.toml": load_rig, "evidence.json": _load_json}
     for name, read in readers.items():

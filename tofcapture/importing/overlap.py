@@ -10,8 +10,9 @@ import numpy as np
 from tofcapture.errors import DataError
 from tofcapture.frames import View
 from tofcapture.importing.rules import Float32
+from tofcapture.importing.truth import NONE, nearest
 from tofcapture.ops.phase import Decoder
-from tofcapture.poses import transform_points
+from tofcapture.poses import Float64, transform_points
 
 _WRONG = 0.03  # m of median difference from which a better reading is looked for
 _BETTER = 3.0  # times smaller differences of another reading
@@ -45,7 +46,7 @@ def compare(view: View, where: str, model: str) -> Overlap:
     """Compare; :class:`DataError` for ground truth that misses the image, or that fits much better mirrored, turned or scaled."""
     decoded = Decoder(view.tof.info).burst(view.tof.raw, float(np.mean(view.tof.celsius)))
     tof = decoded.depth
-    if model == "none":
+    if model == NONE:
         return Overlap(tof, np.full_like(tof, np.nan), decoded.confidence, model)
     truth = seen(view, view.rig.T_tof_stereo)
     found = Overlap(tof, truth, decoded.confidence, model)
@@ -69,15 +70,9 @@ def compare(view: View, where: str, model: str) -> Overlap:
     return found
 
 
-def seen(view: View, T: np.ndarray) -> Float32:
-    """Project the point map into the ToF image (H, W) by ``T``, nearest pixel and nearest depth."""
-    info, points = view.tof.info, transform_points(T, view.stereo.points.reshape(-1, 3))
-    points = points[np.isfinite(points).all(axis=-1) & (points[:, 2] > 1e-3)]
-    out = np.full(info.camera.shape, np.inf)
-    u, v = np.moveaxis(info.camera.project(points)[0], -1, 0)
-    inside = (u > -0.5) & (u < info.camera.width - 0.5) & (v > -0.5) & (v < info.camera.height - 0.5)
-    np.minimum.at(out, (np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)), points[inside, 2])
-    return np.where(np.isfinite(out), out, np.nan).astype(np.float32)
+def seen(view: View, T: Float64) -> Float32:
+    """Project the point map into the ToF image (H, W) by ``T``."""
+    return nearest(transform_points(T, view.stereo.points.reshape(-1, 3)), view.tof.info.camera)
 
 
 def _better(tof: Float32, truth: Float32, view: View, off: float) -> str:

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.view import check_scene_name
+from tofcapture.importing.poses import poses_of, read_poses
 from tofcapture.importing.rules import in_order
 from tofcapture.importing.said import Facts, Said
 from tofcapture.importing.source import Piece, Role, find_pieces, natural
-from tofcapture.importing.vendors import decode, facts_of_layout
+from tofcapture.importing.readers.vendors import decode, facts_of_layout
 
 TRUTH = frozenset(
     [
@@ -77,6 +78,7 @@ AXIS = (
     )
 )
 MOST_NAMED = 5
+SURFACES = (".ply", ".pcd", ".stl", ".obj")
 Array = NDArray[Any]
 Key = tuple[int, ...]
 
@@ -136,7 +138,23 @@ def plan(source: Path, said: Said) -> list[Planned]:
         channels, size = len(said.channels(facts)[0]), said.size(facts)
         views = _views(found, truth.get(scene, []), said, channels, size, source)
         out += [replace(v, scene=check_scene_name(scene), index=i) for i, v in enumerate(views)]
-    return out
+    return _posed(out, [n.piece for n in named if n.role == "pose"], said, source)
+
+
+def _posed(views: list[Planned], pieces: list[Piece], said: Said, source: Path) -> list[Planned]:
+    """Give views the poses that ``[poses] file`` or the source itself has."""
+    if file := said.poses.get("file"):
+        path = (source if source.is_dir() else source.parent) / str(file)
+        stamps, poses = read_poses(path, said)
+        where = str(path)
+    elif pieces and all(p.T is not None for p in pieces):
+        poses, where = np.stack([p.T for p in pieces if p.T is not None]), pieces[0].name
+        known = [p.time_ns for p in pieces if p.time_ns is not None]
+        stamps = np.array(known) * 1e-9 if len(known) == len(pieces) else None
+    else:
+        return views
+    found = poses_of([v.time_ns for v in views], stamps, poses, said, where)
+    return [replace(v, T_world_tof=T) for v, T in zip(views, found, strict=True)]
 
 
 def _named(piece: Piece, said: Said) -> _Named:
@@ -253,7 +271,9 @@ def _of_one(
     """Take one group apart: it is a burst, or has all views of a scene in it."""
     array = read(pieces)
     count, targets = len(array), [t.piece for t in truth]
-    if len(targets) == 1:
+    if len(targets) == 1 and targets[0].path.suffix.lower() in SURFACES:
+        targets *= count
+    elif len(targets) == 1:
         n = _leading(targets[0].load())
         if count == 1 and n == array.shape[1] > 1:  # a truth for every frame: these are views
             array = array[0][:, None]
@@ -355,6 +375,8 @@ def _paired(groups: Mapping[Key, Any], truth: list[_Named], source: Path) -> lis
     if not truth:
         return [None] * len(groups)
     truth = sorted(truth, key=lambda n: natural(n.piece.name))
+    if len(truth) == 1 and truth[0].piece.path.suffix.lower() in SURFACES:  # one surface that all views see
+        return [truth[0].piece] * len(groups)
     keys = {tuple(v for _, v in n.numbers): n.piece for n in truth}
     short = {key[-1:]: piece for key, piece in keys.items()}
     for known in (keys, short):

@@ -25,8 +25,8 @@ from tofcapture.importing.said import Facts, Said
 from tofcapture.poses import Float64
 
 Role = Literal["", "raw", "truth", "pose", "other"]
-READERS = ("arrays", "images")
-"""Modules of this package, asked in this order; the first that claims a path reads it."""
+READERS = ("arrays", "images", "clouds")
+"""Modules of :mod:`tofcapture.importing.readers`, asked in this order; the first that claims a path reads it."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def find_pieces(source: Path, said: Said) -> list[Piece]:
     """
     if not source.exists():
         raise DataError(f"{source}: no such file or folder")
-    readers = [cast("Reader", import_module(f"tofcapture.importing.{name}")) for name in READERS]
+    readers = [cast("Reader", import_module(f"tofcapture.importing.readers.{name}")) for name in READERS]
     found, passed = list[Piece](), list[str]()
     for path in _paths(source, readers):
         reader = next((r for r in readers if r.claims(path)), None)

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from tofcapture.camera import Camera, distorted
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.importing.plan import Planned
-from tofcapture.importing.rules import Float32, metres
+from tofcapture.importing.rules import FARTHEST, NEAREST, Float32, metres
 from tofcapture.importing.said import Said
-from tofcapture.poses import Float64
+from tofcapture.meshes import UNITS
+from tofcapture.poses import Float64, invert, transform_points
 
 NONE = "none"  # model of the camera of a view without ground truth
 _GRID = 0.5  # px that a point map may be off the pinhole that fits it
@@ -41,6 +42,8 @@ def point_map(view: Planned, said: Said, tof: Camera) -> PointMap:
         return PointMap(np.full((*tof.shape, 3), np.nan, np.float32), pinhole, np.eye(4), NONE)
     where = view.pieces[-1].name
     values, kind = view.truth(), str(said.truth.get("kind", ""))
+    if values.shape[1:] in {(3,), (3, 3)} and len(values) > 3:
+        return _of_surface(values, view, said, pinhole, where)
     if values.ndim == 3 and 1 in (values.shape[0], values.shape[-1]):
         values = values.reshape([n for n in values.shape if n > 1])
     if values.ndim == 3 and values.shape[0] == 3 and values.shape[-1] != 3:
@@ -138,6 +141,56 @@ def _of_points(
             hint="the (4, 4) that maps its frame to the ToF frame, metres; of one and the same camera it has ones on the diagonal",
         )
     return PointMap(points, fitted, T, "imported points")
+
+
+def _of_surface(values: NDArray[Any], view: Planned, said: Said, pinhole: Camera, where: str) -> PointMap:
+    """See points (N, 3), or triangles (M, 3, 3), with the ToF camera: the nearest in each pixel; meshes at twice its resolution."""
+    T, T_world = said.transform("T_tof_truth"), said.transform("T_world_truth")
+    if T is None and view.T_world_tof is not None:
+        T = invert(view.T_world_tof) @ (np.eye(4) if T_world is None else T_world)
+    if T is None:
+        raise ConfigError(
+            f"{where}: where it lies is not known: missing [truth] T_tof_truth",
+            hint="the (4, 4) that maps its frame to the ToF frame, metres; or poses of the camera: [poses] file",
+        )
+    unit = str(said.truth.get("unit", "") or view.truth_facts.unit)
+    span = np.linalg.norm(np.ptp(values.reshape(-1, 3), axis=0))
+    scale = UNITS[unit or "m"]
+    if not NEAREST < span * scale < 10 * FARTHEST:
+        fits = [u for u, s in UNITS.items() if NEAREST < span * s < FARTHEST]
+        raise DataError(
+            f"{where}: expected a surface of {NEAREST:g} m and more, got {span * scale:.4g} m across",
+            hint=f'[truth] unit = "{fits[-1]}" in import.toml'
+            if fits
+            else "[truth] unit in import.toml: m, cm or mm",
+        )
+    points = transform_points(T, values * scale)
+    camera = pinhole.scaled(2) if values.ndim == 3 else pinhole
+    depth = _cast(points, camera) if values.ndim == 3 else nearest(points, camera)
+    lifted = (depth[..., None] * camera.rays).astype(np.float32)
+    return PointMap(lifted, camera, np.eye(4), "imported mesh" if values.ndim == 3 else "imported cloud")
+
+
+def _cast(triangles: Float64, camera: Camera) -> Float32:
+    """Cast the rays of a camera at triangles (M, 3, 3) in its frame: depth (H, W), NaN where none is hit."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    corners = np.ascontiguousarray(triangles.reshape(-1, 3), dtype=np.float32)
+    scene.add_triangles(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3))
+    rays = np.concatenate([np.zeros_like(camera.rays), camera.rays], axis=-1).astype(np.float32)
+    found: Float32 = scene.cast_rays(rays)["t_hit"].numpy()
+    return np.where(np.isfinite(found), found, np.float32(np.nan))
+
+
+def nearest(points: Float64, camera: Camera) -> Float32:
+    """Project points (N, 3), camera frame, to the depth (H, W) of the nearest in each pixel; NaN where there is none."""
+    points = points[np.isfinite(points).all(axis=-1) & (points[:, 2] > 1e-3)]
+    out = np.full(camera.shape, np.inf)
+    u, v = np.moveaxis(camera.project(points)[0], -1, 0)
+    inside = (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
+    np.minimum.at(out, (np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)), points[inside, 2])
+    return np.where(np.isfinite(out), out, np.nan).astype(np.float32)
 
 
 def pinhole_of(points: NDArray[np.float32], where: str) -> Camera:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tofcapture import __version__
 from tofcapture.errors import ConfigError, DataError
+from tofcapture.files.check import UNFINISHED
 from tofcapture.files.disk import check_writable
 from tofcapture.files.seal import digest_once, fsync, write_text
 from tofcapture.files.view import open_view, view_path, write_view
@@ -30,8 +31,6 @@ Progress = Callable[[str, int, int], None]
 """Called with a scene, views done, views in all."""
 STANDING: Float64 = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Pose of a camera of which nobody says where it stands: level, looking along y of a base whose z is up."""
-UNFINISHED = "importing"
-"""Folder of a recording in which scenes are made."""
 
 
 @dataclass

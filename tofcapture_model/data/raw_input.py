@@ -13,7 +13,8 @@ from tofcapture.camera import Camera
 from tofcapture.channels import frequencies
 from tofcapture.errors import ConfigError, DataError, UnreadableError
 from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
-from tofcapture.importing.arrays import arrays_of, facts_of
+from tofcapture.importing.readers.arrays import arrays_of, facts_of
+from tofcapture.importing.rigs import tof_rig
 from tofcapture.importing.rules import (
     SATURATION,
     burst_mean,
@@ -23,7 +24,7 @@ from tofcapture.importing.rules import (
     expect_shape,
 )
 from tofcapture.importing.said import Facts
-from tofcapture.rig import RangeError, load_rig
+from tofcapture.rig import RangeError
 
 Float32 = NDArray[np.float32]
 NOMINAL_CAMERA = Camera(width=240, height=180, fx=190.6186, fy=200.7526, cx=116.8406, cy=101.4767)
@@ -135,7 +136,7 @@ def _from_array(path: Path, rig_path: Path | None, saturation: float | None, fra
         )
     raw = held["raw"] if "raw" in held else next(iter(held.values()))
     raw = raw[None] if raw.ndim == 3 else raw
-    rig = load_rig(rig_path) if rig_path else None
+    rig = tof_rig(rig_path, (raw.shape[-2], raw.shape[-1]) if raw.ndim > 2 else None) if rig_path else None
     camera = rig.tof if rig else NOMINAL_CAMERA
     plain = _described(facts_of(held, path), camera, saturation, path)
     if rig:

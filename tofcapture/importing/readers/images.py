@@ -14,7 +14,7 @@ from tofcapture.errors import ConfigError, FormatError
 from tofcapture.importing.rules import roughness
 from tofcapture.importing.said import Said
 from tofcapture.importing.source import Piece
-from tofcapture.importing.vendors import decode, facts_of_bytes, layout_of
+from tofcapture.importing.readers.vendors import decode, facts_of_bytes, layout_of
 
 IMAGES = (".png", ".tif", ".tiff", ".pgm", ".bmp")
 BINARY = (".raw", ".bin")

@@ -1,0 +1,1 @@
+"""Readers of files that others wrote; :mod:`tofcapture.importing.source` says what a reader is."""

@@ -1,0 +1,54 @@
+"""Read point clouds and meshes (.ply, .pcd, .stl, .obj) as ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.errors import ConfigError, FormatError
+from tofcapture.importing.said import Said
+from tofcapture.importing.source import Piece
+
+SUFFIXES = (".ply", ".pcd", ".stl", ".obj")
+
+
+def claims(path: Path) -> bool:
+    """Tell by the suffix."""
+    return path.is_file() and path.suffix.lower() in SUFFIXES
+
+
+def pieces(path: Path, said: Said) -> Iterator[Piece]:
+    """List the one cloud or mesh of a file."""
+    del said
+    yield Piece("", path, partial(read_surface, path), role="truth")
+
+
+def read_surface(path: Path) -> NDArray[Any]:
+    """Read points (N, 3), or the corners of triangles (M, 3, 3), in the file's own unit.
+
+    :class:`FormatError` for a file that holds neither, :class:`ConfigError` without Open3D.
+    """
+    try:
+        import open3d as o3d
+    except ImportError as err:
+        raise ConfigError(
+            f"{path}: reading clouds and meshes needs Open3D: {err}", hint="pip install 'tofcapture[capture]'"
+        ) from err
+    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
+    if path.suffix.lower() != ".pcd":
+        mesh = o3d.io.read_triangle_mesh(str(path))
+        if len(mesh.triangles):
+            return np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
+    points = np.asarray(
+        o3d.io.read_point_cloud(str(path), remove_nan_points=True, remove_infinite_points=True).points
+    )
+    if not len(points):
+        raise FormatError(
+            f"{path}: expected points or triangles, found none", hint="copy it again, or leave it out"
+        )
+    return points
