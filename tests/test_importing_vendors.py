@@ -7,8 +7,8 @@ import pytest
 
 from tofcapture.errors import ConfigError, FormatError
 from tofcapture.files.view import find_views, open_view
-from tofcapture.importing.said import Said
 from tofcapture.importing.readers.vendors import decode
+from tofcapture.importing.said import Said
 from tofcapture.importing.views import import_data
 
 C = 299_792_458.0

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.view import check_scene_name
 from tofcapture.importing.poses import poses_of, read_poses
+from tofcapture.importing.readers.vendors import decode, facts_of_layout
 from tofcapture.importing.rules import in_order
 from tofcapture.importing.said import Facts, Said
 from tofcapture.importing.source import Piece, Role, find_pieces, natural
-from tofcapture.importing.readers.vendors import decode, facts_of_layout
 
 TRUTH = frozenset(
     [

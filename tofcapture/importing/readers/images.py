@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError, FormatError
+from tofcapture.importing.readers.vendors import decode, facts_of_bytes, layout_of
 from tofcapture.importing.rules import roughness
 from tofcapture.importing.said import Said
 from tofcapture.importing.source import Piece
-from tofcapture.importing.readers.vendors import decode, facts_of_bytes, layout_of
 
 IMAGES = (".png", ".tif", ".tiff", ".pgm", ".bmp")
 BINARY = (".raw", ".bin")
