@@ -1,7 +1,10 @@
 """The whole way once, on a station with small cameras: record, align, build, train, evaluate, predict, report, check."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 from importlib.resources import files
 from pathlib import Path
 
@@ -203,3 +206,25 @@ def _tof_of(station):
     with SimArm({}, context):
         pass
     return lambda: SimTof({}, context)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+def test_the_commands_of_the_readme_work_as_printed(tmp_path):
+    """What a reader copies from the page runs in its order in an empty folder, and ends with the network on the test split."""
+    text = (Path(__file__).parent.parent / "README.md").read_text()
+    script = "set -e\n" + text.split("```sh\n")[1].split("```")[0]
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-c", script],
+        check=False,
+        cwd=tmp_path,
+        env={**os.environ, "PATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["split"] == "test"
+    network, sensor = (results["methods"][name]["depth"]["pixel"]["mae"] for name in ("model", "sensor"))
+    assert network < sensor
