@@ -56,7 +56,7 @@ def test_every_command_has_help_and_an_example_that_parses(name):
     [
         (["nonsense"], 2),
         (["record"], 2),
-        (["check", "/no/such/path"], 3),
+        (["check", "/no/such/path"], 5),
         (["align", "/no/such/recording"], 5),
         (["simulate", "/no/such/world.toml", "--out", "never.h5"], 3),
         (["build-dataset", "/no/such/recording", "--out", "never"], 5),
@@ -110,6 +110,45 @@ def test_what_is_misspelt_is_named_and_what_was_meant_is_said(line, named, remed
     said, hint = capsys.readouterr().err.splitlines()
     assert named in f"{said} "
     assert hint.startswith(f"  try: {remedy} instead")
+
+
+@pytest.mark.parametrize(
+    ("line", "wanted", "got"),
+    [
+        ("align data", "views of the board", "a dataset"),
+        ("build-dataset data --out x", "a recording", "a dataset"),
+        ("train data/shards/mug.h5 --out x", "a dataset", "a shard"),
+        ("evaluate rec", "a dataset", "a recording"),
+        ("stats rec/views/mug/view-000.h5", "a dataset", "a view file"),
+        ("pack run --out x", "a dataset", "the folder of a run"),
+        ("align notes.txt", "views of the board", "a file .txt"),
+        ("evaluate .", "a dataset", "another folder"),
+    ],
+)
+def test_what_was_given_and_what_is_wanted_are_both_named(line, wanted, got, capsys, tmp_path, monkeypatch):
+    """A path of another kind is called what it is."""
+    monkeypatch.chdir(tmp_path)
+    for name in (
+        "data/shards/mug.h5",
+        "data/manifest.json",
+        "rec/views/mug/view-000.h5",
+        "run/model.safetensors",
+        "notes.txt",
+    ):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text("")
+    assert main(line.split()) == 5
+    said = capsys.readouterr().err
+    assert re.search(rf"expected .*{wanted}.*, got {re.escape(got)}\n", said), said
+
+
+def test_a_file_that_stands_in_the_way_of_a_package_is_named(tmp_path):
+    """A foreign calibration.py where the program is started hides ours; it is not a missing library."""
+    (tmp_path / "calibration.py").write_text("")
+    words = [sys.executable, "-m", "tofcapture", "align", "rec"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 3
+    assert f"{tmp_path / 'calibration.py'} stands in the way" in done.stderr
 
 
 def _options(parsed: argparse.ArgumentParser):

@@ -11,6 +11,7 @@ import numpy as np
 from calibration.registration.clouds import Cloud, stereo_cloud, surface_points, tof_depth
 from calibration.registration.rims import REPEAT, rim_cloud, stereo_rims, tof_rims
 from tofcapture.errors import DataError
+from tofcapture.files.disk import what_is
 from tofcapture.files.view import find_views, open_view
 from tofcapture.frames import View
 from tofcapture.poses import Float64
@@ -40,7 +41,7 @@ def calibration_views(recording: Path) -> list[Path]:
     found = list(find_views(recording).get(folder.name, ()))
     if not found:
         raise DataError(
-            f"{recording}: expected calibration views in {folder}, found none",
+            f"{recording}: expected a recording with views of the board in {folder}, got {what_is(recording)}",
             hint=f"tofcapture record --calibration --out {recording}",
         )
     return found

@@ -216,8 +216,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if os.environ.get("TOFCAPTURE_TRACEBACK"):
             raise
         if isinstance(err, ModuleNotFoundError):
-            hint = "pip install 'tofcapture[all]'"
-            return _failed("Missing", f"the library {err.name} is missing", hint, 3, as_json=as_json)
+            return _failed("Missing", *_missing(err), 3, as_json=as_json)
         from tofcapture.files.disk import is_full
 
         full = "free some space, then run the same command again"
@@ -226,6 +225,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     told = f"\n  next: {outcome.following}" if outcome.following and outcome.exit_code == 0 else ""
     _tell(json.dumps(outcome.data, allow_nan=False, default=str) if as_json else outcome.text + told)
     return outcome.exit_code
+
+
+def _missing(err: ModuleNotFoundError) -> tuple[str, str]:
+    """Say which library is missing, or which file of somebody else stands in the place of a package of ours."""
+    package = str(err.name).partition(".")[0]
+    place = getattr(sys.modules.get(package), "__file__", None)
+    if package in {"tofcapture", "calibration", "tofcapture_model"} and place:
+        return (
+            f"{place} stands in the way of tofcapture's own {package}",
+            "rename it, or run in another folder",
+        )
+    return f"the library {err.name} is missing", "pip install 'tofcapture[all]'"
 
 
 def _tell(text: str) -> None:

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from tofcapture.cli.kit import Command, Outcome, counted, progress
-from tofcapture.errors import ConfigError
+from tofcapture.errors import DataError
 
 
 def _configure_check(parser: argparse.ArgumentParser) -> None:
@@ -20,9 +20,7 @@ def _check(args: argparse.Namespace) -> Outcome:
 
     path: Path = args.path
     if not path.exists():
-        raise ConfigError(
-            f"{path}: expected a file or folder, found nothing there", hint="tofcapture check PATH"
-        )
+        raise DataError(f"{path}: expected a file or folder, got nothing", hint="tofcapture check PATH")
     total = sum(1 for _ in path.rglob("*.h5")) or 1
     files: list[Path] = []
     with progress() as report:

@@ -19,7 +19,7 @@ from tofcapture.dataset.card import write_card
 from tofcapture.dataset.sample import SampleConfig, TruthError, pooled_error
 from tofcapture.dataset.scene import WORK, SceneOutcome, SceneTask, build_scene, versions
 from tofcapture.errors import ConfigError, DataError, TofError
-from tofcapture.files.disk import check_writable
+from tofcapture.files.disk import check_writable, what_is
 from tofcapture.files.layout import BOARD_SCENE
 from tofcapture.files.manifest import Manifest, SceneEntry, assign_splits, write_manifest
 from tofcapture.files.seal import PARTIAL
@@ -167,7 +167,7 @@ def find_scenes(recordings: Sequence[Path]) -> dict[str, tuple[Path, tuple[Path,
         folder = Path(recording) / "views"
         if not folder.is_dir():
             raise DataError(
-                f"{recording}: expected a recording with a folder 'views'",
+                f"{recording}: expected a recording (a folder with views), got {what_is(Path(recording))}",
                 hint="tofcapture record --scene NAME",
             )
         for scene, views in find_views(recording).items():

@@ -38,6 +38,23 @@ class DiskFull(ConfigError):  # noqa: N818  the disk's state
     """The disk takes no more; what is sealed stays, the same command goes on when there is room."""
 
 
+_FOLDERS = {
+    "manifest.json": "a dataset", "shards": "a dataset that is not finished", "views": "a recording",
+    "index.json": "a cache", "model.safetensors": "the folder of a run", "depth.npy": "a prediction",
+}  # fmt: skip
+
+
+def what_is(path: Path) -> str:
+    """Say in a word or two what lies there, by its form: a recording, a shard, nothing; for errors."""
+    if path.is_dir():
+        return next((what for name, what in _FOLDERS.items() if (path / name).exists()), "another folder")
+    if not path.exists():
+        return "nothing"
+    if path.suffix == ".h5":
+        return "a shard" if path.parent.name == "shards" else "a view file"
+    return f"a file {path.suffix}".rstrip()
+
+
 def errno_of(error: BaseException) -> int | None:
     """Find the system's error number; HDF5 hides it in its own words."""
     if isinstance(error, OSError) and error.errno is not None:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture.errors import DataError, FormatError
+from tofcapture.files.disk import what_is
 from tofcapture.files.hdf import dumps
 from tofcapture.files.layout import SPLITS
 from tofcapture.files.seal import write_text
@@ -127,7 +128,7 @@ def load_manifest(dataset: str | Path) -> Manifest:
     path = manifest_path(dataset)
     if not path.is_file():
         raise DataError(
-            f"{path}: cannot read the dataset's manifest: it is not there",
+            f"{dataset}: expected a dataset (a folder with manifest.json), got {what_is(Path(dataset))}",
             hint="tofcapture build-dataset RECORDING --out DIR",
         )
     table = load_signed(path, "dataset's manifest", (FORMAT, VERSION), _AGAIN)
