@@ -121,7 +121,7 @@ def test_what_is_misspelt_is_named_and_what_was_meant_is_said(line, named, remed
         ("evaluate rec", "a dataset", "a recording"),
         ("stats rec/views/mug/view-000.h5", "a dataset", "a view file"),
         ("pack run --out x", "a dataset", "the folder of a run"),
-        ("align notes.txt", "views of the board", "a file .txt"),
+        ("evaluate notes.txt", "a dataset", "a file .txt"),
         ("evaluate .", "a dataset", "another folder"),
     ],
 )
