@@ -171,6 +171,7 @@ def test_one_thing_has_one_name_in_every_help():
         "PAIRS",
         "HAND",
         "TARGET",
+        "none",
         "SOURCE",
         "RECORDING",
         "DATASET",
