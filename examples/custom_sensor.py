@@ -7,10 +7,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import tofcapture_model
 from tofcapture.cli import main as tofcapture
 from tofcapture.devices.station import DEFAULT
 from tofcapture_model.config import preset
-from tofcapture_model.training.train import train
 
 SENSOR = """
 [sim.tof]
@@ -36,24 +36,12 @@ def main(out: str, scenes: str = "3", steps: int = 4) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     station, dataset = folder / "station.toml", folder / "dataset"
     station.write_text(DEFAULT.read_text(encoding="utf-8") + SENSOR, encoding="utf-8")
-    line = [
-        "simulate-dataset",
-        "--suite",
-        "multipath",
-        "--scenes",
-        scenes,
-        "--views",
-        "2",
-        "--frames",
-        "2",
-        "--jobs",
-        "1",
-    ]
+    line = f"simulate-dataset --suite multipath --scenes {scenes} --views 2 --frames 2 --jobs 1".split()
     if tofcapture([*line, "--station", str(station), "--out", str(dataset)]) != 0:
         raise SystemExit("simulate-dataset failed")
     config = preset("demo")  # its crops are larger than this sensor's image: take whole images
     config = replace(config, training=replace(config.training, crop=()))
-    trained = train(config, dataset, folder / "model", stop_after=steps)
+    trained = tofcapture_model.train(config, dataset, folder / "model", stop_after=steps)
     print(f"{trained.steps} steps on 64 x 48 pixels, losses {trained.losses}")
 
 

@@ -4,17 +4,15 @@ import sys
 
 import numpy as np
 
-from tofcapture.files.shard import ShardReader
+import tofcapture
 from tofcapture.ops.phase import Decoder, ambiguity, frequencies, mean_phasors, wrapped_range
 
 
 def main(path: str) -> None:
     """Decode the first view's burst and compare with the depth in the shard."""
-    with ShardReader(path) as shard:
-        info = shard.info
-        raw = np.stack([shard.raw(0, f) for f in range(shard.frames)])  # (F, 8, H, W)
-        celsius = float(np.mean([shard.celsius(0, f) for f in range(shard.frames)]))
-        stored = shard.tof(0).depth
+    with tofcapture.open_shard(path) as shard:
+        info, view = shard.info, shard[0]
+    raw, celsius, stored = view.raw, float(view.celsius.mean()), view.tof.depth  # (F, K, H, W)
 
     phasor = mean_phasors(
         raw, info.modulation_hz, info.phase_rad

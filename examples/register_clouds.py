@@ -1,19 +1,18 @@
 """Register the ToF cloud of one view into its stereo cloud: ``python register_clouds.py rec/views/mug/view-000.h5``."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 
+import tofcapture
 from calibration.registration.clouds import stereo_cloud, surface_points, tof_depth
 from calibration.registration.gate import register
-from tofcapture.files.view import open_view
 from tofcapture.poses import invert, rotation_angle
 
 
 def main(path: str) -> None:
     """Start from the rig that the view was taken with, and say how far registration moves it."""
-    view = open_view(Path(path))
+    view = tofcapture.open_view(path)
     _, depth = tof_depth(view.tof)
     source = surface_points(view.tof, depth)  # (N, 3), ToF frame
     target = stereo_cloud(view.stereo)  # points and normals, stereo frame

@@ -1,6 +1,10 @@
 """The scripts of examples/ run, on small data."""
 
+import importlib
+import importlib.util
+import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -73,6 +77,48 @@ def test_register_clouds(board_view):
 def test_custom_sensor(tmp_path):
     """A sensor of other size is simulated and trained on."""
     assert "64 x 48" in run("custom_sensor.py", tmp_path / "own")
+
+
+NOTEBOOK = EXAMPLES / "whole_way.ipynb"
+
+
+def cells():
+    """Code of the notebook, cell by cell."""
+    notebook = json.loads(NOTEBOOK.read_text())
+    return ["".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code"]
+
+
+def test_the_notebook_is_one():
+    """It is listed, valid, holds no outputs, and every public name that it calls is there."""
+    assert NOTEBOOK.name in (EXAMPLES / "README.md").read_text()
+    notebook = json.loads(NOTEBOOK.read_text())
+    if importlib.util.find_spec("nbformat"):
+        importlib.import_module("nbformat").validate(notebook)
+    assert not any(c.get("outputs") for c in notebook["cells"])
+    text = "\n".join(cells())
+    for package, name in re.findall(r"\b(tofcapture|calibration|tofcapture_model)\.(\w+)\(", text):
+        assert name in importlib.import_module(package).__all__
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_on_the_demos_recording(tmp_path):
+    """Cell after cell, on the demo's views in small numbers, training for seconds; the picture is there."""
+    to = ["--frames", "2", "--out", str(tmp_path / "demo-out/recording")]
+    for what in (
+        ["--calibration", "--views", "6"],
+        *(["--scene", s, "--views", "2"] for s in ("bottle", "mug")),
+    ):
+        assert main(["record", *what, *to]) == 0
+    code = "\n\n".join(cells())
+    assert "minutes=1," in code
+    script = tmp_path / "notebook.py"
+    script.write_text(code.replace("minutes=1,", "minutes=0.1,"))
+    env = {**os.environ, "MPLBACKEND": "Agg"}
+    done = subprocess.run(
+        [sys.executable, script], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "notebook-out/whole-way.png").stat().st_size > 10_000
 
 
 @pytest.fixture

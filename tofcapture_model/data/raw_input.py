@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -117,7 +118,7 @@ def read_input(
         what = "a folder, expected one file" if path.is_dir() else "no such file"
         raise DataError(f"{path}: {what}", hint=_KINDS)
     if path.suffix.lower() in _ARRAYS:
-        return _from_array(path, rig, saturation, frame)
+        return from_arrays(arrays_of(path), path, rig, saturation, frame)
     for option, value in (("--rig", rig), ("--saturation", saturation)):
         if value is not None:
             raise ConfigError(
@@ -127,8 +128,14 @@ def read_input(
     return _from_h5(path, view)
 
 
-def _from_array(path: Path, rig_path: Path | None, saturation: float | None, frame: int | None) -> RawInput:
-    held = arrays_of(path)
+def from_arrays(
+    held: Mapping[str, NDArray[Any]],
+    path: Path,
+    rig_path: Path | None = None,
+    saturation: float | None = None,
+    frame: int | None = None,
+) -> RawInput:
+    """Read a burst from arrays by name, as :func:`read_input` does; ``path`` is what messages call them."""
     if len(held) != 1 and "raw" not in held:
         raise DataError(
             f"{path}: expected one array, or one that is called raw, got {', '.join(held) or 'none'}",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import statistics
-import tempfile
 import time
 from collections.abc import Callable, Hashable
 from pathlib import Path
@@ -29,7 +28,7 @@ from tofcapture.importing.rules import expect_finite
 from tofcapture_model.config import BASELINES
 from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
 from tofcapture_model.data.conditions import Seen, outside
-from tofcapture_model.data.raw_input import RawInput, read_input, taken
+from tofcapture_model.data.raw_input import RawInput, from_arrays, read_input, taken
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
 from tofcapture_model.geometry.decoder import Taps, TorchDecoder
 from tofcapture_model.inference.prediction import Prediction, write_prediction
@@ -218,10 +217,7 @@ def _input_of(source: View | str | Path | NDArray[Any], frame: int | None) -> Ra
         name = f"{source.scene} {source.index}"
         return RawInput(source.tof.raw, source.tof.celsius, source.tof.info, source.rig.tof, name)
     if isinstance(source, np.ndarray):
-        with tempfile.TemporaryDirectory() as folder:  # one reader checks all arrays
-            path = Path(folder) / "array.npy"
-            np.save(path, source)
-            return read_input(path, frame=frame)
+        return from_arrays({"raw": source}, Path("array"), frame=frame)
     return read_input(Path(source), frame=frame)
 
 
