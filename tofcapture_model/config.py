@@ -199,10 +199,7 @@ def _typed(raw: Any, hint: Any, where: str) -> Any:
 def config_from_dict(table: Mapping[str, Any], where: str = "config") -> Config:
     """Read a configuration from plain TOML types: differences from the preset it names, or from the paper.
 
-    Raises
-    ------
-    ConfigError
-        Unknown keys, wrong types, values that contradict each other.
+    Raises :class:`ConfigError`: unknown keys, wrong types, values that contradict each other.
     """
     known = {"preset", "network", "losses", "training", "stage"}
     if table.keys() - known:

@@ -60,10 +60,7 @@ class Estimate(NamedTuple):
 def expect_channels(raw: Tensor, channels: int, network: str) -> None:
     """Refuse another camera's raw channels (B, K, H, W) than a network was made for.
 
-    Raises
-    ------
-    ConfigError
-        ``raw`` has not ``channels`` channels.
+    Raises :class:`ConfigError`: ``raw`` has not ``channels`` channels.
     """
     if raw.shape[1] != channels:
         raise ConfigError(

@@ -300,10 +300,7 @@ def _drift(moved: Drift, old_name: str) -> dict[str, Any]:
 def sample_recording(recording: Path, evidence: Mapping[str, Any], progress: Progress) -> Samples:
     """Measure the residuals of a recording's used views at the transform of an evidence, its range residual taken off.
 
-    Raises
-    ------
-    DataError
-        No views, or unreadable ones.
+    Raises :class:`DataError`: no views, or unreadable ones.
     """
     from tofcapture.files.view import open_view
 

@@ -184,6 +184,10 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
     An item is asked for by ``(epoch, i)``: crop and flip are drawn from ``(seed, epoch, i)``. So an interrupted run goes on with
     the very same samples, whatever the number of workers.
 
+    Raises :class:`DataError`: the split is empty, its frames make no batch, or a cache is not of it;
+    :class:`ConfigError`: a cache with several datasets, or noise to be drawn of cameras that saturate
+    differently.
+
     Parameters
     ----------
     folder, split
@@ -202,13 +206,6 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         Decoded frames and their ground truth are kept in memory up to this size.
     cache
         Folder that ``tofcapture pack`` filled with this split of the one dataset; ``None`` reads the shards.
-
-    Raises
-    ------
-    DataError
-        The split is empty, its frames make no batch, or a cache is not of it.
-    ConfigError
-        A cache with several datasets, or noise to be drawn of cameras that saturate differently.
     """
 
     def __init__(

@@ -48,9 +48,8 @@ def score(
 ) -> tuple[dict[str, Score], int]:
     """Run methods over all frames of a dataset.
 
-    Returns
-    -------
-    scores by method, and how many frames were left out because no pixel of their ground truth is good
+    Returns scores by method, and how many frames were left out because no pixel of their ground truth is
+    good.
     """
     scores = {name: Score() for name in methods}
     empty = 0
@@ -78,9 +77,7 @@ def calibrate(model: JointModel, dataset: Path, device: torch.device) -> dict[st
 
     Without such a split the factor is that of an exact Laplace distribution. The factor is a buffer and goes into checkpoints.
 
-    Returns
-    -------
-    ``factor``, and ``views`` that it was fitted on
+    Returns ``factor``, and ``views`` that it was fitted on.
     """
     if not load_manifest(dataset).split("val"):
         model.error_map.calibration.mul_(LAPLACE_SIGMA)
@@ -123,6 +120,10 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate the sensor's own single frame and a model on a split, at twice the sensor's resolution, over mask == 0.
 
+    Returns what was written; lengths in metres.
+
+    Raises :class:`ConfigError`: ``out`` cannot be written, or no scene of the split begins so.
+
     Parameters
     ----------
     dataset
@@ -141,15 +142,6 @@ def evaluate(
         Torch device.
     progress
         Called with (done, all).
-
-    Returns
-    -------
-    What was written; lengths in metres.
-
-    Raises
-    ------
-    ConfigError
-        ``out`` cannot be written, or no scene of the split begins so.
     """
     dataset = Path(dataset)
     expect_writable(Path(out))
@@ -185,10 +177,7 @@ def evaluate(
 def expect_writable(path: Path) -> None:
     """Say before anything is measured that results cannot be written.
 
-    Raises
-    ------
-    ConfigError
-        It names a folder, or there is no right or no room to write.
+    Raises :class:`ConfigError`: it names a folder, or there is no right or no room to write.
     """
     if path.is_dir():
         raise ConfigError(f"--out {path}: is a folder", hint=f"--out {path / 'results.json'}")
@@ -206,10 +195,7 @@ def expect_writable(path: Path) -> None:
 def take_scenes(data: FrameDataset, split: str, prefix: str) -> list[str]:
     """Leave only frames of scenes whose name begins so; return the scenes' names, sorted.
 
-    Raises
-    ------
-    ConfigError
-        There is none.
+    Raises :class:`ConfigError`: there is none.
     """
     data.samples = [s for s in data.samples if s.scene.startswith(prefix)]
     if not data.samples:

@@ -245,6 +245,11 @@ def measure_runs(
 ) -> dict[str, Any]:
     """Measure the methods without parameters and all runs, one network in memory at a time.
 
+    Returns results; lengths in metres.
+
+    Raises :class:`ConfigError`: no scene of the split begins so, or a network that does not fit the camera;
+    :class:`FormatError`: weights that are not there.
+
     Parameters
     ----------
     dataset
@@ -263,17 +268,6 @@ def measure_runs(
         File that holds every run as soon as it is measured, and gives it back to the next call (:class:`RunFile`); ``None``: none.
     progress
         Called with (done, all).
-
-    Returns
-    -------
-    Results; lengths in metres.
-
-    Raises
-    ------
-    ConfigError
-        No scene of the split begins so, or a network that does not fit the camera.
-    FormatError
-        Weights that are not there.
     """
     target_device = torch.device(device)
     runs = [(name, i, find_model(path)) for name, paths in weights.items() for i, path in enumerate(paths)]

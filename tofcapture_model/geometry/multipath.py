@@ -32,6 +32,9 @@ _FAINT = 1e-3  # of saturation; below it an amplitude is noise
 def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: Tensor, hz: float) -> Tensor:
     """Stack four maps of expected depth errors.
 
+    Returns (B, 4, H, W) metres: error by interreflection of what is seen; the same with the scene continued
+    beyond the image; error by the halo if all light were in it; gap averaged over a wide window.
+
     Parameters
     ----------
     phasor
@@ -40,11 +43,6 @@ def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: 
         (B, 1, H, W) decoded depth and its weight; range of the low minus range of the high frequency; metres.
     intrinsics, hz
         (B, 4 or 12), and the high modulation frequency.
-
-    Returns
-    -------
-    (B, 4, H, W) metres: error by interreflection of what is seen; the same with the scene continued beyond the image; error by
-    the halo if all light were in it; gap averaged over a wide window
     """
     high = phasor[:, 2:]
     amplitude = high.square().sum(1, keepdim=True).sqrt()
@@ -111,9 +109,7 @@ def exchange_error(
     ``surfaces`` (B, 5, H, W) are those of :func:`surface`. A patch has ``step`` pixels; time goes with their inverse fourth power.
     ``margin`` patches are added beyond each border, on its planes: the table does not end where the image does.
 
-    Returns
-    -------
-    (B, 1, H, W) metres, positive where things look too far away
+    Returns (B, 1, H, W) metres, positive where things look too far away.
     """
     size = surfaces.shape[-2:]
     maps = surfaces[:, :, step // 2 :: step, step // 2 :: step]

@@ -49,10 +49,7 @@ def compile_unets(model: Model, device: torch.device) -> None:
 
     Plane fits and losses stay as they are: compiling a whole model was not done after 400 s.
 
-    Raises
-    ------
-    ConfigError
-        The model has no U-Net, or PyTorch would find no C++ compiler for a CPU.
+    Raises :class:`ConfigError`: the model has no U-Net, or PyTorch would find no C++ compiler for a CPU.
     """
     compiler = os.environ.get("CXX", "g++")
     if device.type == "cpu" and shutil.which(compiler) is None:

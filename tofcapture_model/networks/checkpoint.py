@@ -67,10 +67,7 @@ def save_model(
 
     ``float16`` halves the file and rounds every weight to 11 bits; :func:`load_checkpoint` computes in float32 all the same.
 
-    Raises
-    ------
-    DataError
-        A weight that float16 cannot hold.
+    Raises :class:`DataError`: a weight that float16 cannot hold.
     """
     text, weights = dumps_config(config), model.state_dict()
     if precision == "float16":
@@ -106,14 +103,10 @@ def find_model(path: str | Path | None) -> Path:
 def load_checkpoint(path: str | Path | None = None) -> tuple[Model, Config, dict[str, Any]]:
     """Load a file, a run's folder or, with ``None`` or ``bundled``, the bundled weights; strictly, and to compute in float32.
 
-    Returns
-    -------
-    model (in evaluation mode), its configuration, its provenance
+    Returns model (in evaluation mode), its configuration, its provenance.
 
-    Raises
-    ------
-    FormatError
-        Not a checkpoint of this version, or its weights do not fit its configuration.
+    Raises :class:`FormatError`: not a checkpoint of this version, or its weights do not fit its
+    configuration.
     """
     path = find_model(path)
     tensors, header = read_tensors(path)
@@ -148,9 +141,7 @@ def origin(provenance: Mapping[str, Any]) -> dict[str, Any]:
 def learned_from(datasets: Sequence[Path], before: Learned | None = None) -> dict[str, list[str]]:
     """Collect what a checkpoint remembers of the ``train`` splits of datasets, and of the weights that it started from.
 
-    Returns
-    -------
-    ``objects``: names, sorted; ``shards``: the first twelve digits of their SHA-256, sorted
+    Returns ``objects``: names, sorted; ``shards``: the first twelve digits of their SHA-256, sorted.
     """
     objects, shards = set((before or {}).get("objects", ())), set((before or {}).get("shards", ()))
     for dataset in datasets:
@@ -163,9 +154,8 @@ def learned_from(datasets: Sequence[Path], before: Learned | None = None) -> dic
 def not_new(provenance: Mapping[str, Any], dataset: Path, split: str) -> dict[str, str] | None:
     """Find the scenes of a split that a network has learned from, by the provenance of its checkpoint.
 
-    Returns
-    -------
-    ``the same shard`` or ``object NAME`` by scene; ``None`` where the checkpoint does not tell what it was trained on
+    Returns ``the same shard`` or ``object NAME`` by scene; ``None`` where the checkpoint does not tell what
+    it was trained on.
     """
     if "learned" not in provenance:
         return None

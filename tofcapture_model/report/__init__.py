@@ -24,6 +24,9 @@ def write_report(
 ) -> Path:
     """Write the page.
 
+    Raises :class:`ConfigError`: neither a dataset nor results are given, or jinja2 or matplotlib is missing;
+    :class:`DataError`, :class:`FormatError`: a part that is given is damaged or foreign.
+
     Parameters
     ----------
     dataset
@@ -36,13 +39,6 @@ def write_report(
         The HTML file, written atomically.
     views
         Number of example views, taken evenly from the split that ``results`` names, otherwise from ``test``.
-
-    Raises
-    ------
-    ConfigError
-        Neither a dataset nor results are given, or jinja2 or matplotlib is missing.
-    DataError, FormatError
-        A part that is given is damaged or foreign.
     """
     from tofcapture.viz.page import write_page
     from tofcapture_model.report.content import content

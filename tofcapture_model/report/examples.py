@@ -59,10 +59,7 @@ def load_examples(
 ) -> list[Example]:
     """Read views and let the sensor and the model answer.
 
-    Raises
-    ------
-    DataError, FormatError
-        A shard is missing or damaged.
+    Raises :class:`DataError`, :class:`FormatError`: a shard is missing or damaged.
     """
     out = []
     with _one_thread():

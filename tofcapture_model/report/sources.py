@@ -56,12 +56,8 @@ def read_sources(
 ) -> Sources:
     """Read all parts; at least a dataset or results must be there.
 
-    Raises
-    ------
-    ConfigError
-        Neither is given.
-    DataError, FormatError
-        A part that is given is damaged or foreign, or the dataset is missing.
+    Raises :class:`ConfigError`: neither is given; :class:`DataError`, :class:`FormatError`: a part that is
+    given is damaged or foreign, or the dataset is missing.
     """
     if dataset is None and results is None:
         raise ConfigError("nothing to report", hint="--dataset DIR --results results.json")

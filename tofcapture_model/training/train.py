@@ -61,6 +61,10 @@ def train(
 
     Running it again in the same folder goes on where it stopped; on one device, and without ``minutes``, to the same bits.
 
+    Raises :class:`ConfigError`: the folder holds another run or cannot be written, or ``start`` another
+    network; :class:`BusyError`: another process trains in the folder; :class:`DataError`: a split is empty,
+    or a loss is not finite: no step is taken then.
+
     Parameters
     ----------
     config
@@ -85,15 +89,6 @@ def train(
         Checkpoint, or ``bundled``, to start from instead of random weights (fine-tuning); its network must be the configuration's.
     report
         Called with the stage, what is done of it, all of it, and one line of text.
-
-    Raises
-    ------
-    ConfigError
-        The folder holds another run or cannot be written, or ``start`` another network.
-    BusyError
-        Another process trains in the folder.
-    DataError
-        A split is empty, or a loss is not finite: no step is taken then.
     """
     config = preset(config) if isinstance(config, str) else config
     if epochs is not None:
