@@ -7,12 +7,12 @@ from pathlib import Path
 PATIENCE = 240.0
 
 
-def until(condition):
-    """Wait until a condition holds; its true value."""
+def until(condition, every=0.02):
+    """Wait until a condition holds, asked every so many seconds; its true value."""
     end = time.monotonic() + PATIENCE
     while not (found := condition()):
         assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.02)
+        time.sleep(every)
     return found
 
 

@@ -48,7 +48,7 @@ class Daemon:
             state = self.ask("GET", "/v1/state")
             return state if wanted(state) else None
 
-        return until(found)
+        return until(found, 0.06)  # each answer costs both sides milliseconds
 
     def record(self, views, **more):
         """Queue the views of a mug."""

@@ -188,9 +188,9 @@ def segment_gap(first: Float64, second: Float64) -> Float64:
     q, e = second[..., 0, :], second[..., 1, :] - second[..., 0, :]
     r = p - q
     a, b, c = ((x * y).sum(axis=-1) for x, y in ((d, d), (d, e), (d, r)))
-    f, g = (e * r).sum(axis=-1), np.maximum((e * e).sum(axis=-1), 1e-12)
-    a, across = np.maximum(a, 1e-12), a * g - b * b
-    skew = across > 1e-9 * a * g  # parallel ones: any s does
+    f, g = (e * r).sum(axis=-1), np.maximum((e * e).sum(axis=-1), 1e-300)
+    a, across = np.maximum(a, 1e-300), a * g - b * b
+    skew = across > 1e-12 * a * g  # parallel ones, to a micrometre: any s does
     s = np.clip(np.where(skew, b * f - c * g, 0.0) / np.where(skew, across, 1.0), 0.0, 1.0)
     t = (b * s + f) / g
     s = np.where(t <= 0, np.clip(-c / a, 0.0, 1.0), np.where(t >= 1, np.clip((b - c) / a, 0.0, 1.0), s))
