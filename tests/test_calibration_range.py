@@ -100,26 +100,31 @@ def test_the_surface_is_right_to_a_hundredth_of_a_millimetre():
     assert np.abs(depth - plane_depth(CAMERA, np.eye(4), normal, centre))[good].max() < 1e-5
 
 
-@pytest.mark.parametrize("guess", [np.zeros(6), np.array([2e-4, -3e-4, 3e-4, 3e-4, -3e-4, 2e-4])])
-def test_offset_waves_and_image_terms_come_out(guess):
-    """17 mm, a 6 mm wave and terms over the image: less than a millimetre is left at both frequencies."""
+@pytest.fixture(scope="module")
+def clean():
+    """All views of the sensor as it is, reduced."""
     rng = np.random.default_rng(0)
-    seen = [made(i, rng) for i in range(VIEWS)]
+    return [made(i, rng) for i in range(VIEWS)]
+
+
+@pytest.mark.parametrize("guess", [np.zeros(6), np.array([2e-4, -3e-4, 3e-4, 3e-4, -3e-4, 2e-4])])
+def test_offset_waves_and_image_terms_come_out(clean, guess):
+    """17 mm, a 6 mm wave and terms over the image: less than a millimetre is left at both frequencies."""
     T = poses.exp(guess) @ T_TOF_STEREO
-    fit = fit_ranges(seen, T, np.r_[[3e-4] * 3, [5e-4] * 3])
+    fit = fit_ranges(clean, T, np.r_[[3e-4] * 3, [5e-4] * 3])
     assert (left(fit.errors, ERRORS) < 1e-3).all(), left(fit.errors, ERRORS)
     assert left(fit.errors, ERRORS)[1] < 8e-4
     assert not any({"temperature", "darkness"} & set(t.names) for t in fit.terms)
 
 
-def test_light_thrown_back_shows_as_spread_of_the_views():
+def test_light_thrown_back_shows_as_spread_of_the_views(clean):
     """Views that receive other shares of a detour differ from each other, and the fit says by how much."""
     rng = np.random.default_rng(1)
     seen = [made(i, rng, thrown_back=float(rng.uniform(0, 0.03))) for i in range(VIEWS)]
     fit = fit_ranges(seen, T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
     assert fit.spread[0] > 0.001
-    clean = fit_ranges([made(i, rng) for i in range(VIEWS)], T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
-    assert (clean.spread < 0.0008).all(), clean.spread
+    without = fit_ranges(clean, T_TOF_STEREO, np.r_[[3e-4] * 3, [5e-4] * 3])
+    assert (without.spread < 0.0008).all(), without.spread
 
 
 def test_temperature_and_darkness_are_fitted_when_they_vary():
@@ -232,10 +237,16 @@ def recording(tmp_path_factory):
     return root
 
 
-def test_command_writes_rig_and_report(recording):
-    """calibrate range fits a recording, writes rig.toml and range.json, and says what it could not know."""
-    dry = calibrate("range", recording, "--dry-run")
+@pytest.fixture(scope="module")
+def dry(recording):
+    """What the command says of it without writing."""
+    outcome = calibrate("range", recording, "--dry-run")
     assert not (recording / "rig.toml").exists()
+    return outcome
+
+
+def test_command_writes_rig_and_report(recording, dry):
+    """calibrate range fits a recording, writes rig.toml and range.json, and says what it could not know."""
     outcome = calibrate("range", recording)
     found = load_rig(recording / "rig.toml")
     assert (left(found.range_errors, ERRORS) < 2e-3).all()
@@ -253,9 +264,9 @@ def test_command_writes_rig_and_report(recording):
         calibrate("range", recording, "--orders", "two")
 
 
-def test_the_report_s_numbers_are_those_of_the_sensor(recording):
+def test_the_report_s_numbers_are_those_of_the_sensor(dry):
     """What the report says in millimetres is the error that was put in before the fit, and what it lacks of it afterwards."""
-    data = calibrate("range", recording, "--dry-run").data
+    data = dry.data
     near, far = data["covered_m"]
     assert 0.25 < near < 0.32
     assert 1.3 < far < 2.1
