@@ -1,178 +1,174 @@
-"""The driver arducam over a module of the SDK's shape."""
+"""The driver arducam over files and pipes that hold frames as the modules write them."""
 
-import enum
-import sys
+import os
+import threading
 import time
-from types import ModuleType, SimpleNamespace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests import PATIENCE
+from tests.still_station import recorded
+from tofcapture.camera import Camera
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.devices import registry
 from tofcapture.devices.registry import StationContext
-from tofcapture.devices.tof.arducam import Arducam
+from tofcapture.devices.tof.arducam import ArducamTof
 from tofcapture.errors import ConfigError, DeviceError
+from tofcapture.files.camera_bytes import ARDUCAM, unpack_y12p, with_sign
+from tofcapture.ops.phase import Decoder
 from tofcapture.testing import check_tof
 
-CAMERA = {"width": 24, "height": 18, "fx": 20.0, "fy": 20.0, "cx": 11.5, "cy": 8.5}
-TABLE = {"serial": "A1", "camera": CAMERA, "modulation_hz": [37.5e6] * 4, "phase_rad": [0.0, 1.57, 3.14, 4.71],
-         "exposure": 4e-4}  # fmt: skip
+SMALL = Camera(240, 180, 190.0, 190.0, 119.5, 89.5)
+LARGE = Camera(640, 480, 560.0, 560.0, 319.5, 239.5)
+SOON = 15.0 + PATIENCE
 
 
-class Code(enum.IntEnum):
-    """Stands for TofErrorCode."""
-
-    ArducamSuccess = 0
-    ArducamNoPermission = 5
+def camera_of(mode):
+    return SMALL if "b0410" in mode else LARGE
 
 
-class FakeSdk(ModuleType):
-    """``ArducamDepthCamera`` with the calls that its published examples make; ``frames`` are what it serves."""
-
-    Connection = SimpleNamespace(CSI="csi", USB="usb")
-    FrameType = SimpleNamespace(RAW="raw", DEPTH="depth")
-
-    def __init__(self):
-        super().__init__("ArducamDepthCamera")
-        self.log, self.frames, self.refuse, self.lent = [], [], None, []
-        self.ArducamCamera = lambda: self
-
-    def open(self, mode, index=0):
-        self.log.append(("open", mode, index))
-        return Code.ArducamNoPermission if self.refuse == "open" else Code.ArducamSuccess
-
-    def start(self, kind):
-        self.log.append(("start", kind))
-        return Code.ArducamNoPermission if self.refuse == "start" else Code.ArducamSuccess
-
-    def requestFrame(self, timeout):
-        frame = self.frames.pop(0) if self.frames else None
-        if frame is not None:
-            self.lent.append(frame)
-        return frame
-
-    def releaseFrame(self, frame):
-        self.lent.remove(frame)
-        if hasattr(frame, "raw_data"):
-            frame.raw_data[:] = -1  # the SDK uses the memory again
-        return Code.ArducamSuccess
-
-    def stop(self):
-        self.log.append("stop")
-        return Code.ArducamSuccess
-
-    def close(self):
-        self.log.append("close")
-        return Code.ArducamSuccess
+def table(mode, path):
+    camera = camera_of(mode)
+    numbers = {k: getattr(camera, k) for k in ("width", "height", "fx", "fy", "cx", "cy")}
+    return {"mode": mode, "device": str(path), "serial": "A1", "exposure": 4e-4, "camera": numbers}
 
 
-@pytest.fixture
-def sdk(monkeypatch):
-    """Install the fake SDK."""
-    fake = FakeSdk()
-    monkeypatch.setitem(sys.modules, "ArducamDepthCamera", fake)
-    return fake
+def driver(mode, path):
+    return ArducamTof(table(mode, path), StationContext({}, Path()))
 
 
-def device(**table):
-    return Arducam({**TABLE, **table}, StationContext({}, None))
+def packed(values):
+    """Y12P of values (..., 2 N): written from the layout's words, not from our reader."""
+    v = (values.astype(np.int32) & 0x7FF).astype(np.uint32).reshape(-1, 2)
+    return (
+        np.stack([v[:, 0] >> 4, v[:, 1] >> 4, (v[:, 1] & 15) << 4 | v[:, 0] & 15], axis=1)
+        .astype(np.uint8)
+        .tobytes()
+    )
 
 
-def raw(value, shape=(72, 24)):
-    return SimpleNamespace(raw_data=np.full(shape, value, dtype=np.int16))
+def frames(mode, range_, count, seed=0):
+    """Bytes of ``count`` frames of ours, of surfaces at a range (H, W), metres."""
+    layout, rng = ARDUCAM[mode], np.random.default_rng(seed)
+    out = []
+    for _ in range(count):
+        hz, phases = np.array(layout.modulation_hz), np.array(layout.phase_rad)
+        phi = 4 * np.pi * hz[:, None, None] * range_ / SPEED_OF_LIGHT
+        taps = np.rint(700 * np.cos(phi + phases[:, None, None]) + rng.normal(0, 3, phi.shape))
+        for taken in np.split(taps, layout.frames):
+            rows = np.full(
+                (layout.rows, layout.width), 123.0
+            )  # what lies between the images is not looked at
+            for start, image in zip(layout.starts, taken, strict=True):
+                rows[start : start + layout.height] = image
+            out.append(packed(rows))
+    return b"".join(out)
 
 
-def test_registered_under_its_name():
-    """The registry finds the driver without the SDK."""
+def wall(mode, depth=1.2):
+    camera = camera_of(mode)
+    return depth * np.linalg.norm(camera.unproject(np.ones(camera.shape)), axis=-1)
+
+
+def test_twelve_bits_and_signs():
+    """Two pixels in three bytes, and the low eleven bits of each as a signed number."""
+    assert unpack_y12p(bytes([0xAB, 0xCD, 0xFE])).tolist() == [0xABE, 0xCDF]
+    values = np.arange(-1024, 1024, dtype=np.int16)
+    assert (with_sign(unpack_y12p(packed(values)), 11) == values).all()
+
+
+@pytest.mark.parametrize("mode", ARDUCAM)
+def test_every_mode_gives_the_range(mode, tmp_path):
+    """Frames in the written layout decode to the range that they were made of."""
+    path = tmp_path / "frames.raw"
+    range_ = wall(mode)
+    path.write_bytes(frames(mode, range_, 2))
+    with driver(mode, path) as tof:
+        burst = tof.capture(2)
+    assert burst.raw.dtype == np.int16
+    depth = Decoder(burst.info).burst(burst.raw, 25.0).depth
+    assert np.nanmedian(np.abs(depth - 1.2)) < 0.005
+    assert np.isfinite(depth).mean() > 0.95
     assert registry.load_driver("arducam").keys() == {"tof"}
 
 
-def test_burst_of_phase_images(sdk):
-    """New frames become a burst; the frame that was waiting is not in it, every frame is given back, its memory copied."""
-    stacked = SimpleNamespace(
-        raw_data=np.repeat(np.arange(4, dtype=np.int16) * 100, 18)[:, None] + np.zeros((1, 24), np.int16)
-    )
-    sdk.frames = [raw(1), stacked, None, raw(7)]
-    with device(connection="usb", index=2) as tof:
-        start = time.monotonic_ns()
-        burst = tof.capture(2)
-    assert burst.raw.shape == (2, 4, 18, 24)
-    assert burst.raw.dtype == np.uint16
-    assert burst.raw[0, :, 0, 0].tolist() == [0, 100, 200, 300]
-    assert (burst.raw[1] == 7).all()
-    assert np.isnan(burst.celsius).all()
-    assert start < burst.time_ns[0] <= burst.time_ns[1]
-    assert sdk.lent == []
-    assert sdk.log == [("open", "usb", 2), ("start", "raw"), "stop", "close"]
+def test_rows_with_padding_are_read(tmp_path):
+    """A driver of the kernel may pad rows; what lies there is no pixel."""
+    layout = ARDUCAM["b0410"]
+    data = np.frombuffer(frames("b0410", wall("b0410"), 1)[: layout.size], np.uint8).reshape(180, 360)
+    wide = np.pad(data, ((0, 0), (0, 24)), constant_values=255).tobytes()
+    assert (layout.images(wide) == layout.images(data.tobytes())).all()
 
 
-@pytest.mark.parametrize(
-    ("value", "shape"), [(1, (18, 24)), (1, (144, 24)), (1, (72, 30)), (-5, (72, 24)), (5000, (72, 24))]
-)
-def test_raw_output_of_another_shape_is_refused(sdk, value, shape):
-    """RAW frames that are no stack of the described phase images, or no 12-bit values, are refused, and the camera closed."""
-    sdk.frames = [raw(value, shape)]
-    with device() as tof, pytest.raises(DeviceError, match=r"phase images|12-bit"):
+def test_the_contract_holds(tmp_path):
+    """The conformance suite passes on a file that does not end too soon."""
+    path = tmp_path / "frames.raw"
+    path.write_bytes(frames("b0410", wall("b0410"), 8))
+    check_tof(lambda: driver("b0410", path), frames=2)
+
+
+def test_a_recording_is_made_and_checks(monkeypatch, tmp_path):
+    """From a file of frames to a recording that ``check`` passes."""
+    path = tmp_path / "frames.raw"
+    path.write_bytes(frames("b0548-double", wall("b0548-double", 1.5), 4))
+    view = recorded(monkeypatch, tmp_path, LARGE, table("b0548-double", path), tof=ArducamTof)
+    assert view.tof.info.modulation_hz == (90e6,) * 4 + (15e6,) * 4
+    assert view.provenance["quality"]["misread"] == 0
+
+
+def test_faults_have_names_in_time(tmp_path):
+    """Absent, unplugged in mid-burst, silent and of another mode: each a named error within 15 s."""
+    begun, path = time.monotonic(), tmp_path / "frames.raw"
+    with pytest.raises(DeviceError, match="no /dev/video97"), driver("b0410", "/dev/video97"):
+        pass
+    whole = frames("b0410", wall("b0410"), 3)
+    path.write_bytes(whole[:-1000])
+    with driver("b0410", path) as tof, pytest.raises(DeviceError, match="ended after"):
+        tof.capture(3)
+    with driver("b0548", path) as tof, pytest.raises(DeviceError, match="ended after"):
         tof.capture(1)
-    assert sdk.lent == []
-    assert sdk.log[-2:] == ["stop", "close"]
-
-
-def test_depth_is_refused(sdk):
-    """Depth that the SDK computed is not raw data, and is said not to be."""
-    sdk.frames = [SimpleNamespace(depth_data=np.zeros((18, 24)))]
-    with device() as tof, pytest.raises(DeviceError, match="depth that the SDK computed"):
-        tof.capture(1)
-
-
-def test_no_frames_then_again(sdk):
-    """Frames that do not come are an error; the next capture opens the camera anew."""
-    with device() as tof:
-        with pytest.raises(DeviceError, match="no frame in 10 s"):
-            tof.capture(1)
-        sdk.frames = [raw(1), raw(2)]
-        assert (tof.capture(1).raw == 2).all()
-        with pytest.raises(ConfigError, match="at least 1"):
-            tof.capture(0)
-    tof.close()
-    assert sum(entry[0] == "open" for entry in sdk.log) == 2
-
-
-@pytest.mark.parametrize(
-    ("step", "end"),
-    [("open", [("open", "csi", 0)]), ("start", [("open", "csi", 0), ("start", "raw"), "close"])],
-)
-def test_codes_become_errors(sdk, step, end):
-    """A code other than success is an error with its name; what was opened is closed."""
-    sdk.refuse = step
-    with pytest.raises(DeviceError, match=f"{step}.*ArducamNoPermission"):
-        device().__enter__()
-    assert sdk.log == end
-
-
-def test_sdk_missing_names_what_to_install(monkeypatch):
-    """Without the SDK, describing works and opening says what to install."""
-    monkeypatch.setitem(sys.modules, "ArducamDepthCamera", None)
-    assert device().describe().camera.shape == (18, 24)
-    with pytest.raises(ConfigError, match="needs the Python package") as caught:
-        device().__enter__()
-    assert "pip install ArducamDepthCamera" in caught.value.hint
-
-
-def test_wrong_tables():
-    """What the SDK cannot say must stand in the table; what makes no sense is refused."""
-    with pytest.raises(ConfigError, match="missing: camera"):
-        Arducam({k: v for k, v in TABLE.items() if k != "camera"}, StationContext({}, None))
-    for table, match in (
-        ({"phases": 4}, "unknown: phases"),
-        ({"connection": "wifi"}, "csi"),
-        ({"phase_rad": [0.0]}, "expected a phase for each of 4 channels"),
+    with (
+        pytest.raises(DeviceError, match="no frame for 5 s"),
+        driver("b0410", _pipe(tmp_path, whole[:70000])) as tof,
     ):
-        with pytest.raises(ConfigError, match=match):
-            device(**table)
+        tof.capture(3)
+    with pytest.raises(DeviceError, match="/dev/null"), driver("b0410", "/dev/null") as tof:
+        tof.capture(1)
+    assert time.monotonic() - begun < SOON
 
 
-def test_keeps_the_contract(sdk):
-    """The driver passes the conformance suite of ToF cameras."""
-    sdk.frames = [raw(i) for i in range(40)]
-    check_tof(device)
+def _pipe(folder, data):
+    """A camera that hangs after some bytes: a pipe that stays open."""
+    path = folder / "pipe"
+    os.mkfifo(path)
+
+    def write():
+        with path.open("wb") as pipe:
+            pipe.write(data)
+            pipe.flush()
+            time.sleep(8)
+
+    threading.Thread(target=write, daemon=True).start()
+    return path
+
+
+def test_a_dropped_frame_breaks_no_burst(monkeypatch, tmp_path):
+    """A frame that the kernel dropped costs the four that it belongs to, not the order of the phases."""
+    path = tmp_path / "frames.raw"
+    path.write_bytes(frames("b0410", wall("b0410"), 3))
+    with driver("b0410", path) as tof:
+        own = tof._next
+        numbers = iter([0, 1, 3, 4, 5, 6, 7, 8])
+        monkeypatch.setattr(tof, "_next", lambda: (next(numbers), own()[1]))
+        burst = tof.capture(1)
+        assert next(numbers) == 8
+    assert burst.raw.shape == (1, 4, 180, 240)
+
+
+@pytest.mark.parametrize("change", [{"mode": "b0999"}, {"camera": {"width": 24}}, {"connection": "usb"}])
+def test_wrong_settings_are_refused(change):
+    """Another mode, another size of the image, and settings of the vendor's package are refused at once."""
+    with pytest.raises(ConfigError):
+        ArducamTof({**table("b0410", "x"), **change}, StationContext({}, Path()))

@@ -1,23 +1,26 @@
-"""The driver ``arducam``: an Arducam ToF module through its Python SDK, ``ArducamDepthCamera``; see docs/arducam.md for its limits.
+"""The driver ``arducam``: Arducam ToF modules over V4L2, without the vendor's package; see docs/arducam.md.
 
 ::
 
     [tof]
     driver = "arducam"
-    connection = "usb"
-    modulation_hz = [37.5e6, 37.5e6, 37.5e6, 37.5e6]
-    phase_rad = [0.0, 1.5707963267948966, 3.141592653589793, 4.71238898038469]
+    device = "/dev/video0"
+    mode = "b0548-double"
+    serial = "B0548-1"
     exposure = 400e-6
-    serial = "..."
     [tof.camera]
     ...
 """
 
 from __future__ import annotations
 
+import os
+import select
+import stat
 import time
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,141 +29,186 @@ from numpy.typing import NDArray
 from tofcapture.devices import TofCamera
 from tofcapture.devices.cameras import ReopenedCamera, tof_info
 from tofcapture.devices.host import hosted
-from tofcapture.errors import ConfigError, DeviceError
+from tofcapture.devices.registry import check_keys
+from tofcapture.errors import ConfigError, DeviceError, FormatError
+from tofcapture.files.camera_bytes import ARDUCAM, Arducam
 from tofcapture.frames import TofBurst, TofInfo
 
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
 
-_SETTINGS = ("connection", "index")
-_REQUIRED = ("serial", "camera", "modulation_hz", "phase_rad", "exposure")
-_OPTIONAL = {
-    "model": "Arducam ToF",
-    "illuminator": [0.0, 0.0, 0.0],
-    "saturation": 4095.0,
-    "range_errors": [],
-    "offset": True,
-    "reach": None,
-}
-_REQUEST_MS = 2000
-_MISSES = 5  # frames in a row that may fail to come
+_REQUIRED = ("mode", "serial", "camera", "exposure")
+_OPTIONAL = {"device": "/dev/video0", "illuminator": [0.0, 0.0, 0.0], "range_errors": []}
+_SILENCE = 5.0  # s without a frame
+_BUFFERS = 8
+_PAGE = "docs/arducam.md"
+
+Frame = tuple[int, bytes]  # its number, its bytes
+Next = Callable[[], Frame]
 
 
-class Arducam(ReopenedCamera, TofCamera):
-    """One Arducam ToF module, in RAW output.
+class ArducamTof(ReopenedCamera, TofCamera):
+    """One Arducam ToF module, a device of V4L2; or a file or a pipe of such frames, one after another.
 
     Parameters
     ----------
     table
-        ``connection`` ("csi" or "usb"), ``index`` (default 0), and the module's description, because the SDK says neither
-        its modulation frequencies nor its phase steps: ``serial``, ``camera``, ``modulation_hz``, ``phase_rad``,
-        ``exposure``; optionally ``model``, ``illuminator``, ``saturation``, ``range_errors``, ``offset``, ``reach``.
+        ``mode`` (one of :data:`tofcapture.files.camera_bytes.ARDUCAM`), ``serial``, ``camera``, ``exposure`` (seconds); optionally
+        ``device``, ``illuminator``, ``range_errors``.
     context
         The station; not needed.
     """
 
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
         del context
-        known = {*_SETTINGS, *_REQUIRED, *_OPTIONAL}
-        unknown, missing = sorted(table.keys() - known), [k for k in _REQUIRED if k not in table]
-        if unknown or missing:
+        check_keys(table, (*_REQUIRED, *_OPTIONAL), "[tof]")
+        if missing := [k for k in _REQUIRED if k not in table]:
+            raise ConfigError(f"[tof] arducam: expected {', '.join(missing)}", hint=f"see {_PAGE}")
+        full = {**_OPTIONAL, **table}
+        mode = str(full.pop("mode"))
+        if mode not in ARDUCAM:
             raise ConfigError(
-                f"[tof] arducam: unknown: {', '.join(unknown) or 'none'}; missing: {', '.join(missing) or 'none'}",
-                hint="see docs/arducam.md",
+                f"[tof] mode: expected one of {', '.join(ARDUCAM)}, got {mode!r}", hint=f"see {_PAGE}"
             )
-        self._info = tof_info({**_OPTIONAL, **table}, "[tof] arducam", "docs/arducam.md")
-        self._connection, self._index = str(table.get("connection", "csi")), int(table.get("index", 0))
-        if self._connection not in ("csi", "usb"):
-            raise ConfigError(f'[tof] connection: expected "csi" or "usb", got {self._connection!r}')
-        self._camera: Any = None
+        self._device, self._layout = str(full.pop("device")), ARDUCAM[mode]
+        said = {"model": f"Arducam {mode}", "saturation": 1023.0, "offset": True, "reach": None}
+        said |= {"modulation_hz": self._layout.modulation_hz, "phase_rad": self._layout.phase_rad}
+        self._info = tof_info({**full, **said}, "[tof] arducam", _PAGE)
+        if self._info.camera.shape != (self._layout.height, self._layout.width):
+            raise ConfigError(
+                f"[tof.camera]: {mode} is {self._layout.width} x {self._layout.height}", hint=f"see {_PAGE}"
+            )
+        self._next: Next | None = None
 
     def describe(self) -> TofInfo:
         """Say what ``station.toml`` says of this camera; opens nothing."""
         return self._info
 
+    def probe(self) -> str:
+        """Tell whether the device's file is there."""
+        if not Path(self._device).exists():
+            raise DeviceError(f"Arducam: no {self._device}", hint=_hint(self._device))
+        return self._device
+
     def capture(self, frames: int) -> TofBurst:
         """Take so many new frames.
 
-        Returns the burst with the host's monotonic time at which each frame was handed over, which is after its
-        exposure, and NaN temperatures: the SDK gives neither.
+        Returns
+        -------
+        Burst of signed values with the host's time at which each frame was complete, after its exposure; the module gives no
+        temperature (NaN).
 
-        Raises :class:`ConfigError`: fewer than one frame; :class:`DeviceError`: frames do not come, or are no
-        stack of phase images; the next call opens the camera anew.
+        Raises
+        ------
+        ConfigError
+            Fewer than one frame.
+        DeviceError
+            Frames do not come, or are of another size; the next call opens the device anew.
         """
         if frames < 1:
             raise ConfigError(f"frames: expected at least 1, got {frames}")
-        with self.opened():
-            self._frame()  # one may have been waiting since before the arm stood still
+        with self.opened(), _errors(self._device):
+            for _ in range(_BUFFERS if _is_camera(self._device) else 0):
+                self._take()  # may have waited since before the rig stood still
             raw, times = zip(*(self._frame() for _ in range(frames)), strict=True)
         return TofBurst(np.stack(raw), np.array(times, dtype=np.int64), np.full(frames, np.nan), self._info)
 
     def connect(self, stack: ExitStack) -> None:
-        """Open the module and start its RAW output."""
-        try:
-            import ArducamDepthCamera
-        except ImportError as err:
-            raise ConfigError(
-                f"the driver arducam needs the Python package ArducamDepthCamera: {err}",
-                hint="pip install ArducamDepthCamera, in an environment with numpy below 2",
-            ) from err
-        connections = ArducamDepthCamera.Connection
-        mode = connections.CSI if self._connection == "csi" else connections.USB
-        self._camera = camera = ArducamDepthCamera.ArducamCamera()
-        _succeed(camera.open(mode, self._index), f"open ({self._connection}, {self._index})")
-        stack.callback(camera.close)
-        _succeed(camera.start(ArducamDepthCamera.FrameType.RAW), "start RAW")
-        stack.callback(camera.stop)
+        """Open the device and start its stream."""
+        self.probe()
+        with _errors(self._device):
+            opened = _camera if _is_camera(self._device) else _file
+            self._next = opened(self._device, self._layout, stack)
 
-    def _frame(self) -> tuple[NDArray[np.uint16], int]:
-        """One frame (K, H, W) and the host time (ns) when it was handed over."""
-        for _ in range(_MISSES):
-            frame = self._camera.requestFrame(_REQUEST_MS)
-            now = time.monotonic_ns()
-            if frame is None:
-                continue
-            try:
-                return _phases(frame, self._info), now
-            finally:
-                self._camera.releaseFrame(frame)
+    def _take(self) -> Frame:
+        if self._next is None:
+            raise DeviceError("the Arducam module is not open", hint="use the station as a context manager")
+        return self._next()
+
+    def _frame(self) -> tuple[NDArray[np.int16], int]:
+        """One frame (K, H, W) of ours: phases that come in turn begin with a number that four divides, and none may lack."""
+        count, images = self._layout.frames, list[NDArray[np.int16]]()
+        for _ in range(2 * count):
+            number, data = self._take()
+            if number % count != len(images):
+                images = []  # one was dropped
+            if number % count == len(images):
+                images.append(self._layout.images(data))
+            if len(images) == count:
+                return np.concatenate(images), time.monotonic_ns()
+        raise DeviceError(f"Arducam: {self._device}: frames are dropped", hint="is the machine overloaded?")
+
+
+def _is_camera(path: str) -> bool:
+    return stat.S_ISCHR(Path(path).stat().st_mode)
+
+
+def _hint(path: str) -> str:
+    return f"check the cable, the CSI port's overlay, and v4l2-ctl --device {path} --all; see {_PAGE}"
+
+
+def _await(handle: Any, path: str) -> None:
+    """Wait until there is something to read."""
+    if not select.select([handle], [], [], _SILENCE)[0]:
+        raise DeviceError(f"Arducam: {path}: no frame for {_SILENCE:g} s", hint=_hint(path))
+
+
+def _file(path: str, layout: Arducam, stack: ExitStack) -> Next:
+    """Read frames from a file, or from a pipe, which need not be ready at once."""
+    handle = stack.enter_context(os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0))
+    numbers = iter(range(10**12))
+
+    def take() -> Frame:
+        data = b""
+        while len(data) < layout.size:
+            _await(handle, path)
+            part = handle.read(layout.size - len(data))
+            if not part:
+                raise DeviceError(
+                    f"Arducam: {path} ended after {len(data)} of {layout.size} bytes of a frame"
+                )
+            data += part
+        return next(numbers), data
+
+    return take
+
+
+def _camera(path: str, layout: Arducam, stack: ExitStack) -> Next:
+    """Stream from a device of V4L2."""
+    try:
+        from linuxpy.video.device import BufferType, Device, PixelFormat, VideoCapture
+    except ImportError as err:
+        raise ConfigError(
+            f"the driver arducam needs linuxpy: {err}", hint="pip install 'tofcapture[v4l2]'"
+        ) from err
+    device = stack.enter_context(Device(path))
+    device.set_format(BufferType.VIDEO_CAPTURE, layout.width, layout.rows, PixelFormat.Y12P)
+    found = device.get_format(BufferType.VIDEO_CAPTURE)
+    if (found.width, found.height) != (layout.width, layout.rows) or found.pixel_format != PixelFormat.Y12P:
         raise DeviceError(
-            f"Arducam: no frame in {_MISSES * _REQUEST_MS / 1e3:.0f} s",
-            hint="check its cable and its 5 V, 2 A supply",
+            f"Arducam: {path}: expected {layout.width} x {layout.rows} Y12P, it gives {found.width} x {found.height} {found.pixel_format!r}",
+            hint="set the media graph to this mode first; see docs/arducam.md",
         )
+    stream = VideoCapture(device, size=_BUFFERS)
+    stack.enter_context(stream)
+
+    def take() -> Frame:
+        _await(device, path)
+        frame = stream.buffer.read()
+        return frame.frame_nb, bytes(frame)
+
+    return take
 
 
-def _phases(frame: Any, info: TofInfo) -> NDArray[np.uint16]:
-    """Copy a frame's phase images (K, H, W) out of the SDK's memory.
-
-    Raises :class:`DeviceError`: it is no RAW frame, or not a stack of K images of H x W.
-    """
-    data = getattr(frame, "raw_data", None)
-    if data is None:
-        raise DeviceError(
-            f"Arducam: expected a RAW frame, got {type(frame).__name__}: depth that the SDK computed cannot be recorded",
-            hint="see docs/arducam.md",
-        )
-    K, (H, W) = len(info.modulation_hz), info.camera.shape
-    array = np.asarray(data)
-    if array.shape not in ((K * H, W), (K, H, W)):
-        raise DeviceError(
-            f"Arducam: expected {K} phase images of {H} x {W} below each other, got a frame of shape {array.shape}",
-            hint="this module's RAW output is not the one described in [tof]; see docs/arducam.md",
-        )
-    out = array.reshape(K, H, W).astype(np.int32)
-    if out.min() < 0 or out.max() > 4095:
-        raise DeviceError(
-            f"Arducam: expected 12-bit values, got {out.min()} to {out.max()}", hint="see docs/arducam.md"
-        )
-    return out.astype(np.uint16)
+@contextmanager
+def _errors(path: str) -> Iterator[None]:
+    """Turn errors of the system and of the layout into ours."""
+    try:
+        yield
+    except FormatError as err:
+        raise DeviceError(f"Arducam: {path}: {err.message}", hint=err.hint) from err
+    except OSError as err:
+        raise DeviceError(f"Arducam: {path}: {err.strerror or err}", hint=_hint(path)) from err
 
 
-def _succeed(code: Any, doing: str) -> None:
-    """Turn a code other than success into an error with its name."""
-    if int(code) != 0:
-        raise DeviceError(
-            f"Arducam: {doing}: {getattr(code, 'name', code)}",
-            hint="check its cable, its power, the overlay of the CSI port, and that no other program holds it",
-        )
-
-
-DRIVERS = {"tof": hosted("tof", "tofcapture.devices.tof.arducam:Arducam")}
+DRIVERS = {"tof": hosted("tof", "tofcapture.devices.tof.arducam:ArducamTof")}
