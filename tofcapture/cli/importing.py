@@ -43,6 +43,13 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         help="of the ground truth: m, cm or mm (default: m)",
     )
     add("--layout", metavar="NAME", help="of a camera's raw bytes; an unknown one lists all")
+    add("--dry-run", action="store_true", help="write nothing: say how each array is read, with a picture")
+    add("--picture", type=Path, metavar="FILE.png", help="of --dry-run (default: import.png)")
+    add(
+        "--guess",
+        action="store_true",
+        help="write a first import.toml into SOURCE from what is seen, no more",
+    )
     add("--shape", metavar="H,W", help="image size of .raw files, rows of metadata included")
 
 
@@ -72,9 +79,67 @@ def _said(args: argparse.Namespace, source: Path) -> Said:
     )
 
 
+def _guess(sources: list[Path]) -> Outcome:
+    """Write a first ``import.toml`` beside or into every source."""
+    from tofcapture.files.seal import write_text
+    from tofcapture.importing.look import guess
+    from tofcapture.importing.said import NAME
+
+    written = [(s if s.is_dir() else s.parent) / NAME for s in sources]
+    if there := [path for path in written if path.exists()]:
+        raise ConfigError(f"{there[0]}: is there already", hint="edit it, or move it away")
+    texts = [guess(source) for source in sources]
+    for path, text in zip(written, texts, strict=True):
+        write_text(path, text)
+    names = [str(path) for path in written]
+    told = "\n".join(f"{path}\n{text}" for path, text in zip(names, texts, strict=True))
+    return Outcome({"written": names}, told, following=f"tofcapture import {sources[0]} --dry-run")
+
+
+def _dry_run(args: argparse.Namespace) -> Outcome:
+    """Say how each array is read, and draw amplitude, depth and the overlap of the ground truth."""
+    from tofcapture.channels import channels_in_words
+    from tofcapture.importing.look import look
+    from tofcapture.viz.sheet import write_sheet
+    from tofcapture.viz.shots import Panel, Shot, Source
+
+    found = [one for source in args.sources for one in look(source, _said(args, source))]
+    for text in dict.fromkeys(w for one in found for w in one.overlap.warnings):
+        print(f"tofcapture: {text}", file=sys.stderr)
+
+    def shot(i: int) -> Shot:
+        over = found[i].overlap
+        panels = (
+            Panel("amplitude", "amplitude", over.amplitude),
+            Panel("ToF depth", "depth", over.tof),
+            Panel("ground truth", "depth", over.truth),
+            Panel("truth less ToF", "error", 1e3 * (over.truth - over.tof)),
+        )
+        return Shot(found[i].row()[0], panels)
+
+    picture = args.picture or Path("import.png")
+    rows = [one.row() for one in found]
+    write_sheet(
+        Source(args.sources[0].name, [r[0] for r in rows], shot), picture, 6, lambda _done, _total: None
+    )
+    info = found[0].view.tof.info
+    head = ("view", "raw", "read as", "ground truth", "as", "overlap", "truth less ToF mm")
+    lines = [
+        table(head, rows),
+        f"channels: {channels_in_words(info.modulation_hz, info.phase_rad)}",
+        str(picture),
+    ]
+    data = {"views": [dict(zip(head, r, strict=True)) for r in rows], "picture": str(picture)}
+    return Outcome(data, "\n".join(lines), following=f"tofcapture import {args.sources[0]} --out recording")
+
+
 def _run(args: argparse.Namespace) -> Outcome:
     from tofcapture.importing.views import Imported, import_data
 
+    if args.guess:
+        return _guess(args.sources)
+    if args.dry_run:
+        return _dry_run(args)
     if args.out is None:
         raise ConfigError(
             "expected --out RECORDING", hint=f"tofcapture import {args.sources[0]} --out recordings/mine"
