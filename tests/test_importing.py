@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import h5py
 import numpy as np
 import pytest
 
@@ -75,3 +76,221 @@ def test_again_does_nothing_and_other_data_are_refused(tmp_path):
     with pytest.raises(TofError, match="is not of these data"):
         import_data([source], tmp_path / "rec", Said(tof=TOF))
     assert len(first) == 2
+
+
+def _matlab(path, arrays, *, seven_three=False):
+    """Write arrays as MATLAB does: rows, columns, then the rest; version 7.3 is HDF5 with axes in reverse."""
+    if not seven_three:
+        pytest.importorskip("scipy.io").savemat(path, arrays)
+        return
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, array in arrays.items():
+            file[name] = array.T
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(116))
+
+
+def _images(folder, raw, depth, suffix):
+    """One 16-bit image a channel, and depths in millimetres."""
+    cv2 = pytest.importorskip("cv2")
+    for i, (taps, z) in enumerate(zip(raw, depth, strict=True)):
+        for k, tap in enumerate(taps):
+            cv2.imwrite(str(folder / f"view{i:02d}_c{k}{suffix}"), tap)
+        np.save(folder / f"view{i:02d}_depth.npy", z)
+
+
+def _write(form, folder, raw, depth):
+    """Write one scene of N views in a form; returns what has to be said of it."""
+    if form == "npy":
+        for i in range(len(raw)):
+            np.save(folder / f"raw_{i}.npy", raw[i])
+            np.save(folder / f"depth_{i}.npy", depth[i])
+    elif form == "big-endian":
+        np.save(folder / "raw.npy", raw[:, None].astype(">u2"))
+        np.save(folder / "gt.npy", depth.astype(">f8"))
+    elif form == "npz":
+        for i in range(len(raw)):
+            np.savez(folder / f"{i:04d}.npz", raw=raw[i], depth=depth[i])
+    elif form == "npz-scene":
+        np.savez(folder / "mug.npz", raw=raw[:, None], depth=depth, modulation_hz=HZ, phase_rad=THETA)
+    elif form in ("mat", "mat73"):
+        for i in range(len(raw)):
+            arrays = {"raw": np.moveaxis(raw[i], 0, -1), "depth": depth[i]}
+            _matlab(folder / f"view{i}.mat", arrays, seven_three=form == "mat73")
+    elif form == "hdf5":
+        with h5py.File(folder / "mug.h5", "w") as file:
+            file["tof/raw"], file["gt/depth"] = raw[:, None], depth
+    elif form in (".png", ".tif"):
+        _images(folder, raw, depth, form)
+    elif form == "millimetres":
+        for i in range(len(raw)):
+            np.save(folder / f"raw_{i}.npy", raw[i])
+            np.save(folder / f"depth_{i}.npy", np.float64(1000) * depth[i])
+        return {"truth": {"unit": "mm"}}
+    elif form == "folders":
+        for i in range(len(raw)):
+            (folder / "tof" / f"{i:03d}").mkdir(parents=True)
+            for k in range(8):
+                np.save(folder / "tof" / f"{i:03d}" / f"{k}.npy", raw[i, k])
+            (folder / "depth").mkdir(exist_ok=True)
+            np.save(folder / "depth" / f"{i:03d}.npy", depth[i])
+    elif form == "words":
+        for i in range(len(raw)):
+            (folder / f"raw{i}.raw").write_bytes(raw[i].astype(">u2").tobytes())
+            np.save(folder / f"depth{i}.npy", depth[i])
+        return {"raw": {"shape": list(SHAPE)}}
+    elif form == "points":
+        v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
+        rays = np.stack([(u - TOF["cx"]) / TOF["fx"], (v - TOF["cy"]) / TOF["fy"], 1 + 0 * u], axis=-1)
+        np.save(folder / "raw.npy", raw[:, None])
+        np.save(folder / "xyz.npy", depth[..., None].astype(float) * rays)
+        return {"truth": {"T_tof_truth": np.eye(4).tolist()}}
+    return {}
+
+
+FORMS = (
+    "npy", "big-endian", "npz", "npz-scene", "mat", "mat73", "hdf5", ".png", ".tif", "millimetres", "folders", "words", "points",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_one_scene_is_the_same_views_in_every_form(form, tmp_path):
+    """Taps come back exactly, ground truth to a float's last bits, as one scene of three views."""
+    raw, depth = scenes()
+    folder = tmp_path / "mug"
+    folder.mkdir()
+    views = imported(folder, tmp_path / "rec", **_write(form, folder, raw, depth))
+    assert len(views) == 3
+    for i, view in enumerate(views):
+        assert view.tof.raw.dtype == np.uint16
+        np.testing.assert_array_equal(view.tof.raw[0], raw[i])
+        np.testing.assert_allclose(view.stereo.points[..., 2], depth[i], rtol=3e-7)
+        assert view.scene == "mug"
+    assert check(tmp_path / "rec") == []
+
+
+def none(*_):
+    """Return what spoils without saying anything."""
+
+
+def wrong(folder):
+    """Give functions that spoil a source, what is said about it then, and the word of the remedy."""
+    raw, depth = scenes()
+
+    def put(r=raw, d=depth, **more):
+        for i in range(len(r)):
+            np.save(folder / f"raw_{i}.npy", r[i])
+        for i in range(len(d) if d is not None else 0):
+            np.save(folder / f"depth_{i}.npy", d[i])
+        return more
+
+    def bytes_of(name, data):
+        put()
+        (folder / name).write_bytes(data)
+
+    size = {"width": SHAPE[1], "height": SHAPE[0]}
+    order = [0, 2, 1, 3, 4, 6, 5, 7]
+    colours = np.repeat((depth[0] * 50)[..., None], 3, -1).astype(np.uint8)
+    colours[..., 1] = 0
+    noise = np.random.default_rng(0).integers(0, 4000, raw.shape).astype(np.uint16)
+    T_far = np.eye(4)
+    T_far[0, 3] = 50.0
+    T_left = np.diag([-1.0, 1, 1, 1])
+    identity = np.eye(4).tolist()
+    camera2 = {"width": 20, "height": 15, "fx": 22.0, "fy": 22.0, "cx": 9.5, "cy": 7.0}
+    return {
+        "nothing there": (lambda: None, "found an empty folder", "np.save"),
+        "only text": (lambda: none((folder / "notes.txt").write_text("x")), "found notes.txt", "np.save"),
+        "depth in mm": (lambda: put(d=depth * 1000), "depths of 0.02 to 30 m", 'unit = "mm"'),
+        "depth in cm": (lambda: put(d=depth * 100), "depths of 0.02 to 30 m", "unit"),
+        "metres called mm": (lambda: put(truth={"unit": "mm"}), "as mm say", 'unit = "m"'),
+        "a unit of nobody": (lambda: put(truth={"unit": "in"}), "unit among", ""),
+        "rows and columns swapped": (lambda: put(np.swapaxes(raw, 2, 3), tof={**TOF, **size}), "expected 30 x 40", "axes"),
+        "swapped, size not said": (
+            lambda: put(np.swapaxes(raw, 2, 3), np.swapaxes(depth, 1, 2), tof={**TOF, "cx": 35.0}), "principal point", "axes"
+        ),
+        "taps scaled to one": (lambda: put(raw / 4095.0), "values up to", "4095"),
+        "not a number": (lambda: put(np.where(raw == raw.max(), np.nan, raw / 1.5)), "finite numbers", "saturation"),
+        "eight bits": (lambda: put((raw >> 4).astype(np.uint8)), "more than 8 bits", "16 bits"),
+        "seven channels": (lambda: put(raw[:, :7]), "of 8 channels", "modulation_mhz"),
+        "three channels of colour": (
+            lambda: none(put(), _png(folder / "depth_0.png", colours), (folder / "depth_0.npy").unlink()), "colours", "grey"
+        ),
+        "a depth of 8 bits": (lambda: put(d=(depth * 100).astype(np.uint8)), "expected depths, got uint8", "16 bits"),
+        "half the depths missing": (lambda: put(d=depth[:1]), "ground truth for each of 3 views", "none"),
+        "the last depth missing": (lambda: put(d=depth[:2]), "there is none for 2", "copy"),
+        "the last raw array missing": (lambda: put(raw[:2]), "none for depth_2.npy", "copy the missing raw"),
+        "channels in another order": (lambda: put(raw[:, order]), "do not add up", "phase-order"),
+        "frequencies swapped": (lambda: put(np.roll(raw, 4, axis=1)), "", "phase-order"),
+        "noise": (lambda: put(noise), "", "phase-order"),
+        "no light": (lambda: put(0 * raw), "no light", ""),
+        "all saturated": (lambda: put(np.full_like(raw, 4095)), "100% of the pixels", "expose"),
+        "more bits than said": (lambda: put(raw * 4), "saturates at 4095", "--saturation"),
+        "depth mirrored": (lambda: put(d=depth[:, :, ::-1]), "agrees with the ToF image", "fliplr"),
+        "depth upside down": (lambda: put(d=depth[:, ::-1]), "agrees with the ToF image", "flipud"),
+        "depth turned by half": (lambda: put(d=depth[:, ::-1, ::-1]), "agrees with the ToF image", "rot90"),
+        "depth of another size": (lambda: put(d=depth[:, ::2, ::2]), "depth in the ToF image", "truth.camera"),
+        "depth behind the camera": (lambda: put(d=-depth), "behind it", "OpenGL"),
+        "depth all zero": (lambda: put(d=0 * depth), "every pixel is missing", "leave"),
+        "second camera, no pose": (
+            lambda: put(d=depth[:, ::2, ::2], truth={"camera": camera2}), "missing [truth] T_tof_truth", "(4, 4)"
+        ),
+        "second camera far away": (
+            lambda: put(d=depth[:, ::2, ::2], truth={"camera": camera2, "T_tof_truth": T_far.tolist()}), "covers 0.0%", "metres"
+        ),
+        "left-handed": (
+            lambda: put(d=depth[:, ::2, ::2], truth={"camera": camera2, "T_tof_truth": T_left.tolist()}), "right-handed", ""
+        ),
+        "points without a grid": (lambda: put(d=depth[:, None, None, :, :1]), "", ""),
+        "points of no pinhole": (
+            lambda: put(d=np.random.default_rng(0).random((3, *SHAPE, 3)) + 0.5, truth={"T_tof_truth": identity}), "pinhole", "z forward"
+        ),
+        "no intrinsics": (lambda: put(tof={}), "missing [tof] fx, [tof] fy, [tof] cx, [tof] cy", "--camera"),
+        "a phase too few": (lambda: put(tof={**TOF, "modulation_mhz": [20] * 8, "phase_deg": [0] * 7}), "8 and 7", "phase_deg"),
+        "hertz as megahertz": (
+            lambda: put(tof={**TOF, "modulation_mhz": [20e-6] * 8, "phase_deg": [0, 90, 180, 270] * 2}), "Hz", "20e6"
+        ),
+        "a cut file": (lambda: bytes_of("raw_1.npy", (folder / "x").name.encode()), "raw_1.npy", "again"),
+        "pickled": (lambda: none(put(), np.save(folder / "raw_1.npy", np.array([{}]), allow_pickle=True)), "raw_1.npy", "np.save"),
+        "a size too small": (lambda: none(put(), np.save(folder / "raw_1.npy", raw[1, :, :20])), "", ""),
+        "words without a size": (lambda: none((folder / "raw.raw").write_bytes(b"\0\1" * 999)), "does not say its size", "--shape"),
+        "words of another size": (
+            lambda: (folder / "raw.raw").write_bytes(b"\0\1" * 999) and {"raw": {"shape": [30, 40]}}, "multiple of 30 x 40", "rows"
+        ),
+        "axes of nobody": (lambda: put(raw_={"axes": "XYZ"}), "axes that name", "HWK"),
+        "a layout of nobody": (lambda: put(raw_={"layout": "acme"}), "arducam-b0410", ""),
+        "a kind of nobody": (lambda: put(truth={"kind": "disparity"}), "kind", ""),
+        "poses too few": (lambda: _poses(folder, put, "0 0 0 0 0 0 1\n"), "a pose for each of 3 views, got 1", "one line"),
+        "quaternion that is none": (lambda: _poses(folder, put, "0 0 0 1 2 3 4\n" * 3), "unit quaternion", "order"),
+        "poses that are words": (lambda: _poses(folder, put, "0 0 0 a b c d\n" * 3), "line 1", ""),
+    }  # fmt: skip
+
+
+def _png(path, image):
+    pytest.importorskip("cv2").imwrite(str(path), image)
+
+
+def _poses(folder, put, text):
+    put()
+    (folder / "poses.txt").write_text(text)
+    return {"poses": {"file": "poses.txt"}}
+
+
+NAMES = list(wrong(None))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_wrong_is_named_with_the_remedy(name, tmp_path):
+    """The message says what was expected, the hint what to do; no scene appears, and check does not call the rest whole."""
+    folder = tmp_path / "mug"
+    folder.mkdir()
+    spoil, says, remedy = wrong(folder)[name]
+    said = spoil() or {}
+    if "raw_" in said:
+        said["raw"] = said.pop("raw_")
+    with pytest.raises(TofError) as caught:
+        imported(folder, tmp_path / "rec", **said)
+    assert says in caught.value.message, caught.value.message
+    assert remedy in f"{caught.value.hint} {caught.value.message}", caught.value.hint
+    assert not list((tmp_path / "rec").glob("views/**/*.h5"))
+    assert check(tmp_path / "rec") != []

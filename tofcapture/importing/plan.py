@@ -274,7 +274,7 @@ def _of_one(
     if len(targets) == 1 and targets[0].path.suffix.lower() in SURFACES:
         targets *= count
     elif len(targets) == 1:
-        n = _leading(targets[0].load())
+        n = _leading(targets[0].load(), array.shape[-2:])
         if count == 1 and n == array.shape[1] > 1:  # a truth for every frame: these are views
             array = array[0][:, None]
             count = n
@@ -299,9 +299,10 @@ def _of_one(
     ]
 
 
-def _leading(array: Array) -> int:
-    """Count the views of a ground truth: (N, H, W) or (N, H, W, 3) have several."""
-    several = array.ndim == 4 or (array.ndim == 3 and array.shape[-1] != 3 and array.shape[0] != 3)
+def _leading(array: Array, size: tuple[int, ...]) -> int:
+    """Count the views of a ground truth; several are (N, H, W) or (N, H, W, 3)."""
+    several = array.ndim == 4 or array.shape[1:] == size
+    several = several or (array.ndim == 3 and array.shape[-1] != 3 and array.shape[0] != 3)
     return len(array) if several else 1
 
 
@@ -377,6 +378,14 @@ def _paired(groups: Mapping[Key, Any], truth: list[_Named], source: Path) -> lis
     truth = sorted(truth, key=lambda n: natural(n.piece.name))
     if len(truth) == 1 and truth[0].piece.path.suffix.lower() in SURFACES:  # one surface that all views see
         return [truth[0].piece] * len(groups)
+    if len(truth) > len(groups):
+        spare = [
+            n.piece.name for n in truth if tuple(v for _, v in n.numbers)[-1:] not in {k[-1:] for k in groups}
+        ]
+        raise DataError(
+            f"{source}: expected raw arrays for each of {len(truth)} ground truths, got {len(groups)}; none for {_some(spare)}",
+            hint="copy the missing raw files, or move these ground truths away",
+        )
     keys = {tuple(v for _, v in n.numbers): n.piece for n in truth}
     short = {key[-1:]: piece for key, piece in keys.items()}
     for known in (keys, short):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture import __version__
+from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.check import UNFINISHED
 from tofcapture.files.disk import check_writable
@@ -23,10 +24,11 @@ from tofcapture.importing.overlap import Overlap, compare
 from tofcapture.importing.plan import Planned, plan
 from tofcapture.importing.rules import burst_mean, check_taps, check_unit, expect_finite, signed
 from tofcapture.importing.said import NAME, Said, read_said
-from tofcapture.importing.truth import point_map
+from tofcapture.importing.truth import NONE, point_map
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig, dumps_rig, load_rig
 
+_SAME_PIXEL = 0.1
 Progress = Callable[[str, int, int], None]
 """Called with a scene, views done, views in all."""
 STANDING: Float64 = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -228,15 +230,26 @@ def judged(raw: NDArray[Any], info: TofInfo, where: str, *, known: bool) -> str:
 def _keep_rig(out: Path, rig: Rig, model: str) -> None:
     """Write the recording's rig, once; :class:`ConfigError` when it holds another one."""
     path = out / "rig.toml"
-    if model == "none" and path.is_file():
-        return
     if not path.is_file():
         write_text(path, dumps_rig(rig))
-    elif dumps_rig(load_rig(path)) != dumps_rig(rig):
+        return
+    known = load_rig(path)
+    same = _alike(known.tof, rig.tof) and (
+        model == NONE
+        or (_alike(known.stereo, rig.stereo) and np.allclose(known.T_tof_stereo, rig.T_tof_stereo, atol=1e-6))
+    )
+    if not same:
         raise ConfigError(
             f"{path}: the recording has other cameras than these data",
             hint="import them into another folder: --out; build-dataset takes several recordings",
         )
+
+
+def _alike(a: Camera, b: Camera) -> bool:
+    """Whether cameras are the same but for what is left of fitting one to points."""
+    lens = {c.distortion for c in (a, b)}
+    numbers = [[c.width, c.height, c.fx, c.fy, c.cx, c.cy] for c in (a, b)]
+    return len(lens) == 1 and bool(np.allclose(*numbers, rtol=0, atol=_SAME_PIXEL))
 
 
 def _publish(out: Path, scene: str) -> None:
