@@ -96,6 +96,7 @@ class Planned:
     pieces: tuple[Piece, ...]  #: Everything it is made of.
     time_ns: tuple[int, ...] = ()  #: Stamps of the frames, if the source has them.
     T_world_tof: Any = None  #: (4, 4) pose of the camera, if the source has it.
+    T_tof_truth: Any = None  #: (4, 4) from the frame of the ground truth, if the source has it.
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,7 @@ def _named(piece: Piece, said: Said) -> _Named:
     role: Role = piece.role or next((r for r in said_role if r in roles), "")
     kinds: tuple[tuple[Mapping[str, Any], Role], ...] = ((said.truth, "truth"), (said.raw, "raw"))
     for table, name in kinds:
-        if pattern := table.get("files"):
+        if (pattern := table.get("files")) and not piece.role:
             matches = fnmatch(piece.name, str(pattern)) or fnmatch(Path(place).name, str(pattern))
             role = name if matches else ("" if role == name else role)
     return _Named(piece, role, tuple(words), folders, tuple(numbers))
@@ -319,6 +320,8 @@ def _planned(
         target.facts if target else Facts(),
         (*pieces, *([target] if target else [])),
         stamps if len(stamps) == len(pieces) else (),
+        next((p.T for p in pieces if p.T is not None), None),
+        target.T if target else None,
     )  # fmt: skip
 
 

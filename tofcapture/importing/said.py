@@ -25,8 +25,19 @@ NAME = "import.toml"
 _TOF = (
     "width", "height", "fx", "fy", "cx", "cy", "distortion", "modulation_mhz", "phase_deg", "saturation", "offset", "illuminator", "reach",
 )  # fmt: skip
-_RAW = ("files", "layout", "axes", "shape", "dtype", "celsius")
-_TRUTH = ("files", "kind", "unit", "missing", "axes", "frame", "camera", "T_tof_truth", "T_world_truth")
+_RAW = ("files", "layout", "axes", "shape", "dtype", "celsius", "stamps")
+_TRUTH = (
+    "files",
+    "kind",
+    "unit",
+    "missing",
+    "axes",
+    "frame",
+    "camera",
+    "T_tof_truth",
+    "T_world_truth",
+    "time_offset_s",
+)
 _POSES = ("file", "unit", "maps", "time_offset_s", "shift_s")
 _KEYS = {"tof": _TOF, "raw": _RAW, "truth": _TRUTH, "poses": _POSES}
 

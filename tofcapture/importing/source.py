@@ -25,7 +25,7 @@ from tofcapture.importing.said import Facts, Said
 from tofcapture.poses import Float64
 
 Role = Literal["", "raw", "truth", "pose", "other"]
-READERS = ("arrays", "images", "clouds")
+READERS = ("bags", "arrays", "images", "clouds")
 """Modules of :mod:`tofcapture.importing.readers`, asked in this order; the first that claims a path reads it."""
 
 
@@ -39,7 +39,7 @@ class Piece:
     role: Role = ""  #: What it is, where the reader knows; else its name tells.
     time_ns: int | None = None  #: Its stamp.
     facts: Facts = field(default_factory=Facts)  #: What the file knows of it.
-    #: (4, 4) pose of the camera in the world, of a ``pose``; (4, 4) to the ToF camera, of a ``truth``.
+    #: (4, 4) pose of the camera in the world, of a ``raw`` or ``pose``; (4, 4) to the ToF camera, of a ``truth``.
     T: Float64 | None = None
 
 

@@ -53,6 +53,7 @@ def point_map(view: Planned, said: Said, tof: Camera) -> PointMap:
             "points" if values.ndim == 3 and values.shape[-1] == 3 and values.dtype.kind == "f" else "depth"
         )
     T = said.transform("T_tof_truth")
+    T = view.T_tof_truth if T is None else T
     unit = str(said.truth.get("unit", "") or view.truth_facts.unit)
     missing = said.tuple_of("truth", "missing")
     camera = said.truth_camera() or view.truth_facts.camera

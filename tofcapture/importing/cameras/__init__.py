@@ -166,7 +166,7 @@ def _cameras(tree: Mapping[Any, Any], path: Path) -> Iterator[tuple[str, Found]]
     """List the cameras of a file's dictionary: itself, those numbered in its names, or those below its names."""
     low = {str(k).lower(): v for k, v in tree.items()}
     chain = np.eye(4)
-    if (own := _one(low, f"{path}")) is not None:
+    if (own := camera_of_table(low, f"{path}")) is not None:
         yield "camera", Found(own)
     for end in ("1", "2", "_left", "_right", "l", "r"):
         part = {k.removesuffix(end): v for k, v in low.items() if k.endswith(end)}
@@ -174,7 +174,7 @@ def _cameras(tree: Mapping[Any, Any], path: Path) -> Iterator[tuple[str, Found]]
         if (
             own is None
             and any(k in part for k in MATRIX)
-            and (keys := _one({**shared, **part}, f"{path}: {end}"))
+            and (keys := camera_of_table({**shared, **part}, f"{path}: {end}"))
         ):
             turned = end in ("2", "_right", "r") and "r" in low and "t" in low
             T = (
@@ -188,7 +188,7 @@ def _cameras(tree: Mapping[Any, Any], path: Path) -> Iterator[tuple[str, Found]]
             )  # OpenCV's R, T map camera 1 to 2
     for name, below in tree.items():
         if isinstance(below, Mapping) and (
-            keys := _one({str(k).lower(): v for k, v in below.items()}, f"{path}: {name}")
+            keys := camera_of_table({str(k).lower(): v for k, v in below.items()}, f"{path}: {name}")
         ):
             if "T_cn_cnm1" in below:
                 chain = chain @ invert(
@@ -197,7 +197,7 @@ def _cameras(tree: Mapping[Any, Any], path: Path) -> Iterator[tuple[str, Found]]
             yield str(name), Found(keys, chain if "T_cn_cnm1" in below or "camera_model" in below else None)
 
 
-def _one(low: Mapping[str, Any], where: str) -> dict[str, Any] | None:
+def camera_of_table(low: Mapping[str, Any], where: str) -> dict[str, Any] | None:
     """Read one camera of a dictionary with names in small letters; ``None`` when it is none."""
     size = _size(low)
     model = str(low.get("distortion_model", low.get("model", low.get("camera_model", "")))).lower()

@@ -1,0 +1,244 @@
+"""Read messages of ROS, and Foxglove's in JSON: images, compressed images, clouds, cameras, transforms."""
+
+from __future__ import annotations
+
+import base64
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.camera import Camera
+from tofcapture.errors import ConfigError, DataError, FormatError
+from tofcapture.importing.cameras import camera_of_table
+from tofcapture.poses import Float64, transform
+from tofcapture.rig import camera_from
+
+_KINDS = {"8U": "u1", "8S": "i1", "16U": "u2", "16S": "i2", "32S": "i4", "32F": "f4", "64F": "f8"}
+_NAMED = {
+    "mono8": "8UC1",
+    "mono16": "16UC1",
+    "rgb8": "8UC3",
+    "bgr8": "8UC3",
+    "rgba8": "8UC4",
+    "bgra8": "8UC4",
+}
+_FOXGLOVE = {
+    "RawImage": "Image",
+    "CompressedImage": "CompressedImage",
+    "CameraCalibration": "CameraInfo",
+    "FrameTransform": "TFMessage",
+}
+_DAMAGED = (
+    "ros2 bag reindex, rosbag reindex or mcap recover mend what a killed recorder left; else copy it again"
+)
+Message = tuple[str, str, int, Any]
+"""Topic, type without its package, time of recording in nanoseconds, message."""
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """Open a bag: what is called with ``(topics, start, stop)`` lists its :data:`Message`.
+
+    Raises :class:`FormatError` for a file that is damaged or of another kind, :class:`ConfigError` without the library.
+    """
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+    except ImportError as err:
+        raise ConfigError(
+            f"{path}: reading bags needs rosbags: {err}", hint="pip install 'tofcapture[bags]'"
+        ) from err
+    if path.suffix == ".mcap" and _is_json(path):
+        yield lambda topics=(), start=None, stop=None: _json_messages(path, topics, start, stop)
+        return
+    try:
+        with AnyReader([path], default_typestore=_types()) as bag:
+
+            def messages(
+                topics: Any = (), start: int | None = None, stop: int | None = None
+            ) -> Iterator[Message]:
+                chosen = [c for c in bag.connections if not topics or c.topic in topics]
+                for link, time, data in bag.messages(chosen, start, stop) if chosen else ():
+                    yield (
+                        link.topic,
+                        link.msgtype.split("/")[-1],
+                        time,
+                        lambda d=data, t=link.msgtype: bag.deserialize(d, t),
+                    )
+
+            yield messages
+    except (AnyReaderError, OSError, ValueError, KeyError, AssertionError, struct.error) as err:
+        raise FormatError(f"{path}: cannot read the bag: {err}", hint=_DAMAGED) from err
+
+
+@lru_cache(maxsize=1)
+def _types() -> Any:
+    """ROS 2's messages, for bags that do not hold their own."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def _is_json(path: Path) -> bool:
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    try:
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+    except (McapError, OSError, struct.error, EOFError) as err:
+        raise FormatError(f"{path}: cannot read the MCAP file: {err}", hint=_DAMAGED) from err
+    kinds = {c.message_encoding for c in summary.channels.values()} if summary else set()
+    if kinds - {"json", "cdr", "ros1"}:
+        raise FormatError(
+            f"{path}: expected messages of ROS or JSON, got {', '.join(sorted(kinds))}",
+            hint="mcap convert, or record with ros2 bag",
+        )
+    return "json" in kinds
+
+
+def _json_messages(path: Path, topics: Any, start: int | None, stop: int | None) -> Iterator[Message]:
+    import json
+
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        for schema, channel, m in make_reader(file).iter_messages(list(topics) or None, start, stop):
+            kind = _FOXGLOVE.get(schema.name.split(".")[-1], "") if schema else ""
+            yield channel.topic, kind, m.log_time, lambda d=m.data, k=kind: _foxglove(json.loads(d), k)
+
+
+def _foxglove(told: Mapping[str, Any], kind: str) -> Any:
+    """Give a message of Foxglove's the names that ROS's has."""
+    stamp = SimpleNamespace(sec=told["timestamp"]["sec"], nanosec=told["timestamp"]["nsec"])
+    header = SimpleNamespace(stamp=stamp, frame_id=told.get("frame_id", told.get("parent_frame_id", "")))
+    if kind == "TFMessage":
+        move, turn = (SimpleNamespace(**told[k]) for k in ("translation", "rotation"))
+        link = SimpleNamespace(translation=move, rotation=turn)
+        one = SimpleNamespace(header=header, child_frame_id=told["child_frame_id"], transform=link)
+        return SimpleNamespace(transforms=[one])
+    rest = {k: v for k, v in told.items() if k not in {"timestamp", "frame_id", "data"}}
+    data = np.frombuffer(base64.b64decode(told["data"]), np.uint8) if "data" in told else None
+    return SimpleNamespace(header=header, data=data, is_bigendian=0, **rest)
+
+
+def stamp_of(message: Any) -> int:
+    """Return the stamp of a message's header, nanoseconds."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def image_of(message: Any, where: str) -> NDArray[Any]:
+    """Read an image, a compressed one or a cloud: (H, W), (H, W, C) or points (H, W, 3).
+
+    Raises :class:`FormatError` for encodings that lose values, with what to record instead.
+    """
+    if hasattr(message, "fields"):
+        return _cloud(message, where)
+    if hasattr(message, "format"):
+        return _compressed(bytes(message.data), message.format.lower(), where)
+    name = _NAMED.get(message.encoding, message.encoding)
+    found = re.fullmatch(r"(8U|8S|16U|16S|32S|32F|64F)C(\d+)", name)
+    if found is None:
+        raise FormatError(
+            f"{where}: expected an encoding such as 16UC1, 16SC1, 32FC1 or mono16, got {message.encoding}",
+            hint="record the raw or depth topic, not a picture of it",
+        )
+    kind, C = np.dtype((">" if message.is_bigendian else "<") + _KINDS[found[1]]), int(found[2])
+    H, W, step = message.height, message.width, message.step or message.width * C * kind.itemsize
+    data = np.asarray(message.data, np.uint8)
+    if data.size < H * step or step < W * C * kind.itemsize:
+        raise DataError(
+            f"{where}: expected {H} rows of {W * C * kind.itemsize} bytes ({message.encoding}), got {data.size} bytes, step {step}"
+        )
+    rows = data[: H * step].reshape(H, step)[:, : W * C * kind.itemsize]
+    out = np.ascontiguousarray(rows).view(kind).reshape((H, W) if C == 1 else (H, W, C))
+    return out.astype(kind.newbyteorder("="))
+
+
+def _compressed(data: bytes, told: str, where: str) -> NDArray[Any]:
+    """Decode PNG, TIFF and ROS's compressedDepth: 12 bytes before a PNG, which holds inverse depth where depth was float."""
+    import cv2
+
+    at = data.find(b"\x89PNG\r\n\x1a\n", 0, 64)
+    if "jpeg" in told or "jpg" in told or "rvl" in told or data[:2] == b"\xff\xd8":
+        lost = "rvl is not read" if "rvl" in told else "JPEG loses what is measured"
+        raise FormatError(
+            f"{where}: expected lossless images, got {told}: {lost}",
+            hint="ros2 run image_transport republish compressed raw, or record the raw topic or compressedDepth with png",
+        )
+    found = cv2.imdecode(np.frombuffer(data, np.uint8, offset=max(at, 0)), cv2.IMREAD_UNCHANGED)
+    if found is None:
+        raise FormatError(f"{where}: expected a PNG or TIFF, got {len(data)} bytes of {told!r}")
+    out = np.asarray(found)
+    if at == 12 and "32fc1" in told:
+        _, a, b = struct.unpack("<iff", data[:12])
+        out = np.where(out > 0, np.float32(a) / (out.astype(np.float32) - np.float32(b)), np.float32(np.nan))
+    return out
+
+
+def _cloud(message: Any, where: str) -> NDArray[Any]:
+    fields = {f.name: f for f in message.fields}
+    H, W = message.height, message.width
+    if not {"x", "y", "z"} <= fields.keys() or H < 2:
+        got = "a cloud without rows and columns" if H < 2 else f"fields {', '.join(fields)}"
+        raise FormatError(
+            f"{where}: expected an organised cloud with x, y, z, got {got}",
+            hint="record the camera's organised point map or its depth image; filters and voxel grids lose the rows",
+        )
+    kinds = {7: "f4", 8: "f8"}
+    kind = np.dtype(
+        {
+            "names": list("xyz"),
+            "formats": [
+                (">" if message.is_bigendian else "<") + kinds.get(fields[n].datatype, "f4") for n in "xyz"
+            ],
+            "offsets": [fields[n].offset for n in "xyz"],
+            "itemsize": message.point_step,
+        }
+    )
+    rows = np.asarray(message.data, np.uint8).reshape(H, message.row_step)[:, : W * message.point_step]
+    points = np.ascontiguousarray(rows).view(kind).reshape(H, W)
+    return np.stack([points[n] for n in "xyz"], axis=-1).astype(np.float32)
+
+
+def camera_of(message: Any, where: str, *, rectified: bool) -> Camera:
+    """Read a CameraInfo: K and D of a raw image, P of a rectified one; :class:`DataError` when nobody calibrated it."""
+    told = {str(k).lower(): v for k, v in vars(message).items()} if hasattr(message, "__dict__") else {}
+    if not told:
+        told = {n.lower(): getattr(message, n) for n in getattr(message, "__slots__", ())}
+    P = np.asarray(told["p"]).reshape(3, 4)
+    if rectified and P[0, 0]:
+        told |= {"k": P[:, :3].ravel(), "d": [], "distortion_model": ""}
+    if not np.asarray(told["k"])[0]:
+        raise DataError(
+            f"{where}: expected a calibrated camera, got a CameraInfo of zeros",
+            hint="--camera fx,fy,cx,cy[,k1,k2,p1,p2,k3]",
+        )
+    told["roi"] = (
+        {k: getattr(told["roi"], k) for k in ("x_offset", "y_offset", "width", "height")}
+        if told.get("roi")
+        else {}
+    )
+    return camera_from(
+        camera_of_table({k: v for k, v in told.items() if k not in {"header", "r", "p", "data"}}, where)
+        or {},
+        where,
+    )
+
+
+def transforms_of(message: Any) -> Iterator[tuple[str, str, int, Float64]]:
+    """List parent, child, stamp and (4, 4) of a message of transforms."""
+    from scipy.spatial.transform import Rotation
+
+    for one in message.transforms:
+        q, t = one.transform.rotation, one.transform.translation
+        T = transform(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [t.x, t.y, t.z])
+        yield one.header.frame_id.strip("/"), one.child_frame_id.strip("/"), stamp_of(one), T
