@@ -10,8 +10,8 @@ pytest.importorskip("nxlib")
 
 from tests.fake_nxlib import FakeCamera, FakeNxLib, installed
 from tofcapture.devices import registry
-from tofcapture.devices.ensenso import CaptureTimeoutError, Ensenso, metres
 from tofcapture.devices.registry import StationContext
+from tofcapture.devices.stereo.ensenso import CaptureTimeoutError, Ensenso, metres
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.testing import check_stereo
 

@@ -124,7 +124,7 @@ def probe_nxlib() -> Iterator[Finding]:
 
 
 def _load_ensenso() -> str:
-    from tofcapture.devices.ensenso import library
+    from tofcapture.devices.stereo.ensenso import library
 
     with library(None):
         return "loads"

@@ -320,5 +320,7 @@ def _symbol(err: Any) -> tuple[str, str]:
 
 # Opening waits until the SDK has looked through the network for cameras.
 DRIVERS = {
-    "stereo": hosted("stereo", "tofcapture.devices.ensenso:Ensenso", {"__enter__": 40.0, "capture": 120.0})
+    "stereo": hosted(
+        "stereo", "tofcapture.devices.stereo.ensenso:Ensenso", {"__enter__": 40.0, "capture": 120.0}
+    )
 }

@@ -1,0 +1,1 @@
+"""Drivers of stereo cameras, a file each."""
