@@ -120,16 +120,7 @@ def build_scene(
 ) -> SceneOutcome:
     """Do a task unless its shard is there already; a view that cannot be used is an outcome, not an exception.
 
-    Parameters
-    ----------
-    task
-        What to do.
-    pool
-        Makes samples in parallel; ``None``: here.
-    progress
-        Told after each view.
-    only_look
-        Say whether it is there, build nothing.
+    ``pool`` makes samples in parallel, ``progress`` is told after each view; ``only_look`` says whether it is there.
     """
     with one_thread():
         try:
@@ -161,17 +152,10 @@ def build_shard(
 ) -> str:
     """Make one shard, whole or not at all.
 
-    Returns the SHA-256 of the shard.
+    ``inputs`` are the SHA-256 of the view files. Returns that of the shard.
 
     Raises :class:`DataError`: a view is damaged or is of another camera than the rig, or stereo measured
     nothing in the ToF camera's image in any view; nothing is left behind.
-
-    Parameters
-    ----------
-    task, pool, progress
-        As for :func:`build_scene`.
-    inputs
-        SHA-256 of each view file.
     """
     first, _ = read_depth_view(task.views[0])
     decoder = decoder_for(first, task.rig)

@@ -42,12 +42,9 @@ class Device(Protocol):
     def watch(self, silence: float) -> None:
         """Look after the open device; a driver host calls this a few times a second from another thread.
 
-        Raises :class:`ArmFault`: something is wrong: the host then reports this, and ends the driver.
+        ``silence`` are the seconds since the station's process gave a sign of life.
 
-        Parameters
-        ----------
-        silence
-            Seconds since the station's process gave a sign of life.
+        Raises :class:`ArmFault`: something is wrong: the host then reports this, and ends the driver.
         """
         del silence
 
@@ -180,16 +177,9 @@ class Operator(Device, Protocol):
         ...
 
     def turn(self, scene: str, angle: float) -> None:
-        """Return when the scene is turned about the vertical.
+        """Return when the scene is turned about the vertical, counter-clockwise seen from above, radians from how it stood first.
 
         Raises :class:`DeviceError`: nobody can turn it.
-
-        Parameters
-        ----------
-        scene
-            Its name.
-        angle
-            From how it stood first, counter-clockwise seen from above, radians.
         """
         raise DeviceError(f"nobody can turn {scene!r} by {angle:.2f} rad", hint="record without --turns")
 

@@ -16,17 +16,7 @@ if TYPE_CHECKING:
 
 
 class ConsoleOperator(Operator):
-    """Asks on stderr, waits for Enter on stdin.
-
-    Parameters
-    ----------
-    table
-        Empty.
-    context
-        The station; not needed.
-    ask, answer
-        Where to ask and to listen; the terminal unless a test says otherwise.
-    """
+    """Asks on stderr, waits for Enter on stdin, unless ``ask`` and ``answer`` are given; its ``table`` is empty."""
 
     person = True
     can_turn = True

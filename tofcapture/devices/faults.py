@@ -10,15 +10,7 @@ from tofcapture.errors import DeviceError, MotionStopped
 
 
 class ArmFault(DeviceError):  # noqa: N818  a state of the arm
-    """The arm needs a person.
-
-    Parameters
-    ----------
-    message
-        What was seen.
-    hint
-        What to do; the state's own ``remedy`` unless given.
-    """
+    """The arm needs a person; the hint is the state's own ``remedy`` unless given."""
 
     remedy = "look at the arm before anything else, then start again"
 

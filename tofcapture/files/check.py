@@ -34,16 +34,9 @@ _OWN = ("manifest.json", "croissant.json", "shards", "simulation", "stats.html",
 
 
 def check(path: Path, progress: Tell | None = None) -> list[Problem]:
-    """List every problem.
+    """List every problem of a view file, a shard, the folder of a recording, a dataset or a cache; none when all is well.
 
-    Returns nothing when everything is as it should be. Whatever the data, this does not raise.
-
-    Parameters
-    ----------
-    path
-        A view file, a shard, the folder of a recording, a dataset or a cache.
-    progress
-        Told each file before it is read.
+    ``progress`` is told each file before it is read. Whatever the data, this does not raise.
     """
     path, tell = Path(path), progress or (lambda _: None)
     if path.is_dir():

@@ -166,14 +166,7 @@ def assign_splits(
     train, since chance would leave splits empty; with ten or more, an empty test set takes the group with the largest
     hash. A dataset of one group trains.
 
-    Returns the split of each scene.
-
-    Parameters
-    ----------
-    scenes
-        Names, in any order.
-    objects
-        Names of the objects in a scene, for the scenes where they are known.
+    Returns the split of each scene; ``objects`` names those in a scene, where they are known.
     """
     known = objects or {}
     things = {scene: {object_of(scene), *map(str, known.get(scene, ()))} for scene in sorted(scenes)}

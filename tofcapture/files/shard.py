@@ -175,13 +175,8 @@ class ShardReader:
     Raises :class:`DataError`, :class:`FormatError`: on first use: a file that is missing, damaged, foreign or
     of another version.
 
-    Parameters
-    ----------
-    path
-        Of the shard.
-    sha256
-        Its digest in the manifest; ``None``: the one beside it counts, if there is one. On first use the whole file is hashed,
-        once per process and for the processes that it hands readers to (docs/decisions/0016).
+    ``sha256`` is its digest in the manifest; without, the one beside it counts, if there is one. On first use the whole file
+    is hashed, once per process and for the processes that it hands readers to (docs/decisions/0016).
     """
 
     def __init__(self, path: Path | str, sha256: str | None = None) -> None:
@@ -423,14 +418,7 @@ def _checksum(row: Array) -> int:
 class ShardWriter:
     """Streams samples into ``NAME.h5.partial`` and seals it; left without :meth:`seal`, nothing remains.
 
-    Parameters
-    ----------
-    path
-        Final name of the shard.
-    scene, rig, tof_info, stereo_info
-        Root attributes.
-    views
-        Number of samples that will be added.
+    ``path`` is its final name, ``views`` the number of samples that will be added; the others become root attributes.
     """
 
     def __init__(

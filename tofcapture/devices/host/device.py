@@ -235,20 +235,12 @@ def hosted(
     deadlines: Mapping[str, float] | None = None,
     overdue: type[ArmFault] = HostLost,
 ) -> Callable[[Mapping[str, Any], StationContext], Any]:
-    """Make a factory, for ``DRIVERS``, of a driver that lives in a child process.
+    """Make a factory, for ``DRIVERS``, of a driver that lives in a child process; ``role`` is ``arm``, ``tof`` or ``stereo``.
+
+    ``target`` is ``module:name`` of the driver's own factory; the module imports without the vendor's library. ``deadlines``
+    are seconds by verb, where the usual ones do not fit; ``overdue`` is what a missed one means for this device.
 
     Raises :class:`ConfigError`: another role.
-
-    Parameters
-    ----------
-    role
-        ``arm``, ``tof`` or ``stereo``.
-    target
-        ``module:name`` of the driver's own factory. The module imports without the vendor's library.
-    deadlines
-        Seconds by verb, where the usual ones do not fit.
-    overdue
-        What it means for this device when a call exceeds its deadline.
     """
     if role not in _KINDS:
         raise ConfigError(f"hosted driver: expected a role of {', '.join(_KINDS)}, got {role!r}")

@@ -28,18 +28,10 @@ _LAST_WORDS = 400  # characters of what the library printed, for the error messa
 
 
 class Host:
-    """One child process with one driver in it.
+    """One child process with one driver in it; ``name`` says in messages what the device is: ``arm``.
 
-    Parameters
-    ----------
-    name
-        What the device is, for messages: ``arm``.
-    order
-        ``target``, ``table`` and ``context`` of the driver.
-    guard
-        Seconds without a sign of the parent after which the child ends itself, even if its library hangs.
-    overdue
-        What it means for this device when a call exceeds its deadline.
+    ``order`` holds ``target``, ``table`` and ``context`` of the driver. ``guard`` are the seconds without a sign of the
+    parent after which the child ends itself, even if its library hangs; ``overdue`` is what a missed deadline means.
     """
 
     def __init__(self, name: str, order: Mapping[str, Any], guard: float, overdue: type[ArmFault]) -> None:

@@ -53,19 +53,12 @@ def to_host(near: Anchor, rate: float, module_us: int) -> int:
 
 
 def burst_times(anchors: Sequence[Anchor], clocks_us: Sequence[int], period_us: int) -> NDArray[np.int64]:
-    """Host times (ns) of a burst's exposures.
+    """Host times (ns) of a burst's exposures, by the module's clock at the start of each frame and the time between two.
+
+    ``anchors`` are from opening, from before the burst, and from after it.
 
     Raises :class:`ClockError`: the clock drifts as no crystal's does, or the times do not lie in order within
     the burst.
-
-    Parameters
-    ----------
-    anchors
-        From opening, from before the burst, and from after it.
-    clocks_us
-        Module clock at the start of each frame.
-    period_us
-        From one frame's start to the next.
     """
     first, before, after = anchors
     rate = drift(first, after)
