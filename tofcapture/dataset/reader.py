@@ -47,6 +47,9 @@ class DatasetView(NamedTuple):
 class Dataset:
     """All views of a dataset, or of one of its splits, by scene and number.
 
+    Raises :class:`DataError`: the manifest is missing or damaged; at an index, a shard is;
+    :class:`ConfigError`: there is no such split.
+
     Parameters
     ----------
     folder
@@ -60,13 +63,6 @@ class Dataset:
     ----------
     shards
         :class:`tofcapture.files.shard.ShardReader` by scene. Each opens on first use and pickles as its path.
-
-    Raises
-    ------
-    DataError
-        The manifest is missing or damaged; at an index, a shard is.
-    ConfigError
-        There is no such split.
     """
 
     def __init__(self, folder: str | Path, split: str | None = None, scale: Scale = 2) -> None:

@@ -70,10 +70,8 @@ class Arm(Device, Protocol):
     def await_view(self, index: int) -> ArmState:
         """Return when a person has brought the rig to another view and it stands still; only where ``by_hand``.
 
-        Raises
-        ------
-        MotionStopped
-            Somebody said stop, or nobody did it in time: the view is taken when the scene is asked for again.
+        Raises :class:`MotionStopped`: somebody said stop, or nobody did it in time: the view is taken when
+        the scene is asked for again.
         """
         raise DeviceError(f"view {index}: this arm moves by itself", hint="call move_to")
 

@@ -93,17 +93,11 @@ class ArducamTof(ReopenedCamera, TofCamera):
     def capture(self, frames: int) -> TofBurst:
         """Take so many new frames.
 
-        Returns
-        -------
-        Burst of signed values with the host's time at which each frame was complete, after its exposure; the module gives no
-        temperature (NaN).
+        Returns burst of signed values with the host's time at which each frame was complete, after its
+        exposure; the module gives no temperature (NaN).
 
-        Raises
-        ------
-        ConfigError
-            Fewer than one frame.
-        DeviceError
-            Frames do not come, or are of another size; the next call opens the device anew.
+        Raises :class:`ConfigError`: fewer than one frame; :class:`DeviceError`: frames do not come, or are of
+        another size; the next call opens the device anew.
         """
         if frames < 1:
             raise ConfigError(f"frames: expected at least 1, got {frames}")

@@ -82,17 +82,11 @@ class Espros(ReopenedCamera, TofCamera):
     def capture(self, frames: int) -> TofBurst:
         """Take so many frames, each of one camera frame a frequency.
 
-        Returns
-        -------
-        Burst of the values on the wire (uint16, 2048 is no signal, from 64000 on flags), the time in the middle of each frame, and
-        the chip's temperature.
+        Returns burst of the values on the wire (uint16, 2048 is no signal, from 64000 on flags), the time in
+        the middle of each frame, and the chip's temperature.
 
-        Raises
-        ------
-        ConfigError
-            Fewer than one frame.
-        DeviceError
-            Frames do not come, or not in the mode that was set; the next call opens the camera anew.
+        Raises :class:`ConfigError`: fewer than one frame; :class:`DeviceError`: frames do not come, or not in
+        the mode that was set; the next call opens the camera anew.
         """
         if frames < 1:
             raise ConfigError(f"frames: expected at least 1, got {frames}")
