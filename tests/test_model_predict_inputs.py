@@ -326,7 +326,7 @@ def test_bundled_is_a_name_where_a_path_is_asked_for(weights, tmp_path, monkeypa
 def test_the_lines_of_the_page_answer_frame_after_frame(weights, tmp_path, monkeypatch, capsys):
     """The example of "bring your own camera", on a burst of two frames."""
     page = (ROOT / "docs/howto/own-camera.md").read_text()
-    code = next(c for c in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Predictor" in c)
+    code = next(c for c in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "load_model" in c)
     monkeypatch.setattr(checkpoint, "files", lambda _: weights.parents[1])
     monkeypatch.chdir(tmp_path)
     saved(tmp_path / "frames.npy", burst_of(NOMINAL_CAMERA, 2))

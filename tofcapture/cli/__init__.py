@@ -146,13 +146,13 @@ def _run(argv: Sequence[str]) -> Outcome:
     named = next((a for a in argv if not a.startswith("-")), None)
     if named is not None and named not in entries:
         raise UsageError(f"no command {named!r}", hint=_meant(named, entries, "tofcapture"))
-    wanted = {named: entries[named]} if named in entries else entries
-    top = parser({name: _load(entry) for name, entry in wanted.items()}, named=named in entries)
-    args = top.parse_args(argv)
-    if args.command is None:
+    if named is None:
+        top = parser({name: _load(entry) for name, entry in entries.items()}, named=False)
+        top.parse_args(argv)
         return Outcome(text=top.format_help().rstrip())
-    with at_work(args.command):
-        return _load(entries[args.command]).run(args)
+    with at_work(named):
+        command = _load(entries[named])
+        return command.run(parser({named: command}).parse_args(argv))
 
 
 class _Terminated(KeyboardInterrupt):

@@ -32,7 +32,7 @@ def seen_by(data: FrameDataset, before: Seen | None = None) -> dict[str, Any]:
     for frame in map(data.frame, some):
         there = frame.valid > 0
         if there.any():
-            rows.append({"brightness": float(frame.confidence[there].median())})
+            rows.append({"brightness": round(float(frame.confidence[there].median()), 4)})
     found: dict[str, Any] = {}
     for name in _BEYOND:
         values = [row[name] for row in rows if name in row] + list((before or {}).get(name, ()))
