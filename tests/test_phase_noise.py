@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofcapture.errors import DataError
-from tofcapture.ops.phase import TapNoise, photon_transfer
+from tofcapture.ops.phase import photon_transfer
 
 
 def burst(frames, electrons, read, low=20.0, high=3000.0, seed=0, shape=(8, 90, 120)):
@@ -49,7 +49,7 @@ def test_noise_that_does_not_grow_has_no_electrons():
     rng = np.random.default_rng(0)
     clean = rng.uniform(100, 3000, (8, 40, 40))
     found = photon_transfer([np.rint(clean + 3 * rng.standard_normal((10, *clean.shape)))], 4095)
-    assert found == TapNoise(found.electrons_per_unit, pytest.approx(3, rel=0.05))
+    assert found.read == pytest.approx(3, rel=0.05)
     assert found.electrons_per_unit > 1000
 
 

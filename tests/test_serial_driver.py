@@ -99,7 +99,7 @@ def test_describe_needs_an_opening_or_a_table(tmp_path):
     table = {"model": "m", "serial": "s", "camera": shape, "modulation_hz": [2e7] * 4, "phase_rad": [0.0, 1.5, 3.1, 4.7],
              "exposure": 4e-4, "saturation": 4095.0}  # fmt: skip
     assert camera("/dev/nowhere", tmp_path, **table).describe().camera.fy == 21.0
-    with pytest.raises(ConfigError, match="one phase_rad for each"):
+    with pytest.raises(ConfigError, match="expected a phase for each of 4 channels"):
         camera("/dev/nowhere", tmp_path, **{**table, "phase_rad": [0.0]}).describe()
     with pytest.raises(ConfigError, match="does not know bauds"):
         camera("/dev/nowhere", tmp_path, bauds=9)

@@ -7,6 +7,7 @@ range modulo ``U = c / 2f``. Ranges of several frequencies agree on a few vector
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,20 @@ BARELY_APART = 0.1  # the same, within a reach that somebody states: bright surf
 _MOST_WRAPS = 200  # of the highest frequency; as far as anybody looks who does not say how far
 _SAME = 0.02  # as TOLD_APART counts; closer vectors are the same for everybody
 _NOISE = 0.25  # wraps that noise may carry a range across a wrap's end
+
+
+@dataclass(frozen=True)
+class TapNoise:
+    """Noise of one tap of one frame: variance ``tap / electrons_per_unit + read^2`` in raw units squared."""
+
+    electrons_per_unit: float = 16.0  #: Photo-electrons per raw unit.
+    read: float = 1.25  #: Standard deviation of the electronics, raw units.
+
+    def __post_init__(self) -> None:
+        if not (self.electrons_per_unit > 0 and 0 <= self.read < np.inf):
+            raise ConfigError(
+                f"noise: expected electrons_per_unit above 0 and read of 0 at least, got {self.electrons_per_unit:g} and {self.read:g}"
+            )
 
 
 def frequencies(modulation_hz: Sequence[float]) -> tuple[float, ...]:
@@ -210,3 +225,23 @@ def parse_reach(value: object, where: str) -> Reach | None:
     except (TypeError, ValueError) as err:
         raise ConfigError(f"{where}: reach: expected two ranges in metres, got {value!r}") from err
     return low, high
+
+
+def noise_table(noise: TapNoise | None) -> dict[str, float | None] | None:
+    """Write noise as JSON types; where light makes none there are no electrons per unit."""
+    if noise is None:
+        return None
+    gain = noise.electrons_per_unit
+    return {"electrons_per_unit": gain if np.isfinite(gain) else None, "read": noise.read}
+
+
+def parse_noise(value: object, where: str) -> TapNoise | None:
+    """Read what :func:`noise_table` wrote, or nothing; :class:`ConfigError` for anything else."""
+    if value is None:
+        return None
+    try:
+        gain, read = value.get("electrons_per_unit"), value["read"]  # type: ignore[attr-defined, index]
+        return TapNoise(np.inf if gain is None else float(gain), float(read))
+    except (AttributeError, KeyError, TypeError, ValueError) as err:
+        expected = "{electrons_per_unit = 16.0, read = 1.25}, raw units"
+        raise ConfigError(f"{where}: noise: expected {expected}, got {value!r}") from err

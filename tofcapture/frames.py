@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.channels import Reach, check_channels
+from tofcapture.channels import Reach, TapNoise, check_channels
 from tofcapture.errors import DataError
 from tofcapture.poses import Float64, check_transform
 from tofcapture.rig import RangeError, Rig
@@ -38,7 +38,7 @@ TOF_FLAG_DOCS = {
     TofFlag.FLYING: "on both sides of it, in a row or a column, depth jumps by more than a surface at 80 degrees: a mixed pixel",
     TofFlag.LOW_CONFIDENCE: "shot and read noise make the depth uncertain by more than 20 mm (one standard deviation)",
     TofFlag.AMBIGUOUS: "other wraps fit almost as well, or the frequencies disagree as much as a surface out of reach makes them",
-    TofFlag.INCONSISTENT: "taps of a frequency fit no cosine by more than noise: a stuck or swapped tap, motion; seen with four phases",
+    TofFlag.INCONSISTENT: "taps of a frequency fit no cosine by more than noise: a stuck or swapped tap, motion; with three phases whole lines of a stuck tap",
 }
 
 
@@ -62,6 +62,8 @@ class TofInfo:
     )
     #: Least and largest range of a surface, metres; among these wraps are chosen. ``None``: all that the frequencies tell apart.
     reach: Reach | None = None
+    #: Of one tap of one frame; ``None``: measured on every frame.
+    noise: TapNoise | None = None
 
     def __post_init__(self) -> None:
         where = self.model or "ToF camera"

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.channels import parse_reach
+from tofcapture.channels import noise_table, parse_noise, parse_reach
 from tofcapture.errors import DataError, FormatError, TofError
 from tofcapture.files.disk import unreadable
 from tofcapture.files.layout import Field, Layout
@@ -172,6 +172,7 @@ def tof_table(info: TofInfo) -> dict[str, Any]:
         "range_errors": [range_error_table(e) for e in info.range_errors],
         "offset": bool(info.offset),
         "reach": info.reach and [float(r) for r in info.reach],
+        "noise": noise_table(info.noise),
     }
 
 
@@ -190,6 +191,7 @@ def tof_from(table: Mapping[str, Any], where: str) -> TofInfo:
             range_errors=tuple(range_error_from(e) for e in table["range_errors"]),
             offset=bool(table.get("offset", True)),
             reach=parse_reach(table.get("reach"), where),
+            noise=parse_noise(table.get("noise"), where),
         )
     except TofError as err:
         raise FormatError(

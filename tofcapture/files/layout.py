@@ -124,7 +124,7 @@ def _layout(name: str, version: int, title: str, fields: str, attrs: str) -> Lay
 _DESCRIPTIONS = """\
 units       | text | always "m"; seconds, radians and hertz elsewhere
 rig         | TOML | the rig, see rig.toml below
-tof_info    | JSON | model, serial, intrinsics, illuminator, modulation_hz, phase_rad, exposure, saturation, range_errors, offset, reach
+tof_info    | JSON | model, serial, intrinsics, illuminator, modulation_hz, phase_rad, exposure, saturation, range_errors, offset, reach, noise
 stereo_info | JSON | model, serial, intrinsics of the point map's grid
 provenance  | JSON | versions, digests of inputs, seeds, UTC time
 """

@@ -1,6 +1,6 @@
 """Decode where the network is: the torch form of :class:`tofcapture.ops.phase.Decoder`, with its tables, for GPUs.
 
-Only the taps are copied to the device. No value is looked at on the way, so a CUDA graph can hold all of it.
+Only the taps, and what the host measures of their noise, are copied to the device. No value is looked at on the way, so a CUDA graph can hold all of it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from tofcapture.camera import Camera
 from tofcapture.channels import frequencies, wrap_table
 from tofcapture.errors import DataError
 from tofcapture.frames import TofInfo
-from tofcapture.ops.phase import TapNoise, information
+from tofcapture.ops.phase import information
 from tofcapture.ops.phase.decoder import RADIUS
 from tofcapture.ops.phase.float32 import SURE, UNLIKELY, Correction, tap_rows
+from tofcapture.ops.phase.noise import NoiseLine, NoiseMeter, stuck_lines
 from tofcapture.ops.phase.reference import UNKNOWN_CELSIUS
 from tofcapture.rig import RangeError
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
@@ -31,17 +32,18 @@ _TINY = 1e-30
 
 
 class Taps(NamedTuple):
-    """Hold what is sent to the device for one frame: taps (K, H, W) float32, sensor temperature () float32, NaN if unknown."""
+    """Hold what is sent to the device for one frame, float32."""
 
-    raw: Tensor
-    celsius: Tensor
+    raw: Tensor  #: (K, H, W)
+    celsius: Tensor  #: (), sensor temperature, NaN if unknown
+    noise: Tensor  #: (3,), :class:`tofcapture.ops.phase.noise.NoiseLine`
 
 
 class _Range:
     """Range of one frequency: :class:`tofcapture.ops.phase.float32.Correction` with its tables on the device."""
 
     def __init__(self, error: RangeError, camera: Camera, device: torch.device) -> None:
-        tables = Correction(error, camera)
+        self.host = tables = Correction(error, camera)
         self.step, self.start, self.unambiguous = tables.step, tables.start, tables.R
         self.table = None if tables.plain else torch.from_numpy(tables.table).to(device)
         self.fixed = torch.from_numpy(tables.fixed).reshape(camera.shape).to(device)
@@ -72,8 +74,7 @@ class TorchDecoder:
         hz, known = frequencies(info.modulation_hz), information(info)
         errors = {e.modulation_hz: e for e in info.range_errors}
         self._range = [_Range(errors.get(f, RangeError(f)), camera, device) for f in hz]
-        self._wraps, self._noise = wrap_table(hz, known, info.reach), TapNoise()
-        self._info, self._frequencies = info, len(hz)
+        self._wraps, self._info, self._frequencies = wrap_table(hz, known, info.reach), info, len(hz)
         place = np.asarray(info.illuminator, dtype=np.float64)
         self._quarter, self._nearest = float(place @ place / 4), float(np.sqrt(place @ place) / 2)
 
@@ -82,13 +83,11 @@ class TorchDecoder:
 
         self._length, self._slant = there(camera.ray_lengths), there(camera.rays @ place / 2)
         self._rows = there(tap_rows(info).weights[: 2 * len(hz) + 1])
-        U, self._tops, self._lean = (
-            self._wraps.U,
-            there(self._wraps.tops),
-            there(self._wraps.lean)[:, None, None],
-        )
-        self._unambiguous, self._weight = (
-            there(x)[:, None, None] for x in (U, np.square(2 * np.pi / U) * known)
+        U, self._tops = self._wraps.U, there(self._wraps.tops)
+        weight = np.square(2 * np.pi / U) * known
+        self._meter = NoiseMeter(info, self._wraps, [each.host for each in self._range], weight)
+        self._unambiguous, self._weight, self._lean = (
+            there(x)[:, None, None] for x in (U, weight, self._wraps.lean)
         )
         self._demodulation, self._modulation = demodulation(info).to(device), modulation(info).to(device)
         self._intrinsics = intrinsics_of(camera).to(device)
@@ -98,10 +97,14 @@ class TorchDecoder:
         expected = (self._rows.shape[1], *self._length.shape)
         if raw.shape != expected:
             raise DataError(f"decode: expected raw of shape {expected}, got {raw.shape}")
-        device = self._length.device
+        device, raw = self._length.device, np.ascontiguousarray(raw)
+        known = celsius if np.isfinite(celsius) else UNKNOWN_CELSIUS
+        stated = self._info.noise
+        line = NoiseLine.of(stated, 1) if stated else self._meter(raw[None], known, stuck_lines(raw))
         return Taps(
             torch.from_numpy(np.ascontiguousarray(raw, dtype=np.float32)).to(device),
             torch.tensor(celsius, dtype=torch.float32).to(device),
+            torch.tensor(line, dtype=torch.float32).to(device),
         )
 
     def __call__(self, taps: Taps) -> Frame:
@@ -116,7 +119,8 @@ class TorchDecoder:
         each = zip(self._range, real, imag, amplitude, strict=True)
         ranges = torch.stack([range_(i, q, size, celsius) for range_, i, q, size in each])
         mean = rows[2 * F] if self._info.offset else amplitude[-1]
-        variance = mean / self._noise.electrons_per_unit + (self._noise.read**2 + 1e-12)
+        slope, dark, least = taps.noise.unbind()
+        variance = torch.maximum(mean * slope + dark, least)
         lit = amplitude.amin(0) > 0
         saturation = self._info.saturation
         sure = lit & (raw.amax(0) < saturation) & (raw.amin(0) > -saturation)

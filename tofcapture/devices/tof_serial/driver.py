@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _SETTINGS = ("port", "baud", "firmware", "description")
 _DESCRIPTION = (
     "model", "serial", "camera", "illuminator", "modulation_hz", "phase_rad", "exposure", "saturation", "range_errors",
-    "offset", "reach",
+    "offset", "reach", "noise",
 )  # fmt: skip
 _BAUD = 921_600
 _SMALLEST, _LARGEST = 512, 16384  # bytes of a chunk
@@ -76,7 +76,8 @@ class SerialTof(ReopenedCamera, TofCamera):
         return self._described(_said_by(self._module) if self._module else read_description(self._file))
 
     def _described(self, said: Mapping[str, Any] | None) -> TofInfo:
-        known = {"illuminator": [0.0, 0.0, 0.0], "range_errors": [], **(said or {})}
+        plain = {"range_errors": [], "offset": True, "reach": None, "noise": None}
+        known = {"illuminator": [0.0, 0.0, 0.0], **plain, **(said or {})}
         table = described(known, self._table, _DESCRIPTION, self._where)
         return tof_info(table, self._where, "docs/serial-protocol.md, station.toml")
 

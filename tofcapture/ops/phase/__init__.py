@@ -6,16 +6,15 @@ complex number ``A exp(i phi)``. Bursts are averaged as phasors, never as phases
 :class:`Decoder` turns taps into depth at more than a thousand frames a second.
 """
 
-from tofcapture.channels import ambiguity, frequencies
+from tofcapture.channels import TapNoise, ambiguity, frequencies
 from tofcapture.ops.phase.decoder import Decoder, DepthMaps, Signals, flying_pixels
+from tofcapture.ops.phase.noise import photon_transfer
 from tofcapture.ops.phase.phasors import (
     Complex128,
     Float64,
-    TapNoise,
     information,
     mean_phasors,
     phasors,
-    photon_transfer,
     radial_to_range,
     taps,
     wrapped_range,

@@ -14,26 +14,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.channels import frequencies, wrap_table
+from tofcapture.channels import TapNoise, frequencies, wrap_table
 from tofcapture.errors import DataError
 from tofcapture.frames import TofFlag, TofInfo
 from tofcapture.ops.phase import float32
 from tofcapture.ops.phase.float32 import Correction, Float32
-from tofcapture.ops.phase.phasors import TapNoise, information
+from tofcapture.ops.phase.noise import NoiseLine, NoiseMeter, median_of_chi_squared, middle, stuck_lines
+from tofcapture.ops.phase.phasors import information
 from tofcapture.ops.phase.reference import UNKNOWN_CELSIUS
 from tofcapture.rig import RangeError
 
 RADIUS = 2  # px of the window that is asked where a pixel alone cannot tell its wraps
 UNCERTAIN = 0.020  # m, standard deviation from which a pixel is of low confidence
 _STEEP = float(np.tan(np.radians(80)))
-_SAMPLE = 41  # pixels apart, of those whose misfit tells the frame's own noise
-_BROKEN = 0.25  # of a row's or column's pixels inconsistent: all of it is
+_BROKEN = 0.25  # of a row's or column's pixels, more than noise has, are odd: all of it is inconsistent
+_ODD = 0.1  # of the pixels, as far as noise goes
 _GROSS = np.float32(0.25**2)  # of the power: more is off in no sound tap, whatever the noise of the frame
 
 
 def _rare(count: int) -> float:
     """Chi squared of so many degrees of freedom that noise exceeds in one of 30,000 pixels."""
     return 17 + 2.8 * count
+
+
+def _odd(count: int) -> float:
+    """Chi squared of so many degrees of freedom that noise exceeds in :data:`_ODD` of the pixels, or a little fewer."""
+    return 0.6 + 2.1 * count
 
 
 @dataclass(frozen=True)
@@ -68,13 +74,13 @@ class Decoder:
     info
         Channels, intrinsics, light source, saturation, range errors and reach.
     noise, min_amplitude
-        Of one tap: decides which pixels are of low confidence and where neighbours are asked. Pixels whose weakest amplitude is not
-        above the least, raw units, have no depth.
+        Of one tap: decides which pixels are of low confidence and where neighbours are asked; what ``info`` says, or without that
+        what each frame or burst shows. Pixels whose weakest amplitude is not above the least, raw units, have no depth.
     """
 
     def __init__(self, info: TofInfo, noise: TapNoise | None = None, min_amplitude: float = 0.0) -> None:
         hz = frequencies(info.modulation_hz)
-        self.info, self.noise = info, noise or TapNoise()
+        self.info, self.noise = info, noise or info.noise
         rows = float32.tap_rows(info)
         self._rows, self._spare = float32.sparse(rows.weights), rows.spare
         by_hz = {e.modulation_hz: e for e in info.range_errors}
@@ -94,6 +100,7 @@ class Decoder:
         self._slant = (info.camera.rays @ s / 2).ravel().astype(np.float32)
         self._quarter, self._nearest = np.float32(s @ s / 4), np.float32(np.sqrt(s @ s) / 2)
         F, pixels = len(hz), info.camera.width * info.camera.height
+        self._meter = NoiseMeter(info, self.wraps, self._corrections, self._weight)
         self._taps = np.empty((len(rows.weights), pixels), np.float32)
         self._ranges, self._power = np.empty((2, F, pixels), np.float32)
         self._which, self._doubt = np.empty(pixels, np.int32), np.empty(pixels, bool)
@@ -103,7 +110,7 @@ class Decoder:
     def __call__(self, raw: NDArray[Any], celsius: float = float("nan")) -> DepthMaps:
         """Decode one frame (K, H, W) of taps, any real dtype; :class:`DataError` when it is of another shape."""
         self._expect(raw.shape)
-        return self._decode(raw, celsius, 1, self._saturated(raw))
+        return self._decode(raw, raw[None], celsius, self._saturated(raw))
 
     def signals(self, raw: NDArray[Any], celsius: float = float("nan")) -> tuple[DepthMaps, Signals]:
         """Decode one frame (K, H, W), or the mean of some, and keep the phasors and the ranges of all frequencies."""
@@ -118,7 +125,7 @@ class Decoder:
         """Decode a burst (frames, K, H, W), averaged as I and Q; a pixel is saturated when it is in any frame."""
         self._expect(raw.shape[1:])
         saturated = self._saturated(raw.reshape(-1, *raw.shape[2:]))
-        return self._decode(raw.mean(axis=0, dtype=np.float64), celsius, len(raw), saturated)
+        return self._decode(raw.mean(axis=0, dtype=np.float64), raw, celsius, saturated)
 
     def _expect(self, shape: tuple[int, ...]) -> None:
         expected = (len(self.info.modulation_hz), *self.info.camera.shape)
@@ -133,8 +140,9 @@ class Decoder:
         return saturated.ravel()
 
     def _decode(
-        self, raw: NDArray[Any], celsius: float, frames: int, saturated: NDArray[np.bool_]
+        self, raw: NDArray[Any], each: NDArray[Any], celsius: float, saturated: NDArray[np.bool_]
     ) -> DepthMaps:
+        """Decode taps (K, H, W) that are the mean of ``each`` (frames, K, H, W)."""
         celsius = celsius if np.isfinite(celsius) else UNKNOWN_CELSIUS
         float32.combine(np.ascontiguousarray(raw).reshape(len(raw), -1), *self._rows, self._taps)
         F = len(self._power)
@@ -143,9 +151,12 @@ class Decoder:
         confidence = np.sqrt(self._power[-1])
         # Taps without an offset do not tell how much light there was: at least their amplitude.
         mean = self._taps[2 * F] if self.info.offset else confidence
-        np.multiply(mean, np.float32(1 / (frames * self.noise.electrons_per_unit)), out=self._variance)
-        self._variance += np.float32(self.noise.read**2 / frames + 1e-12)
         bad = ~(self._power.min(axis=0) > self._min_power) | saturated
+        stuck = stuck_lines(raw)
+        line = NoiseLine.of(self.noise, len(each)) if self.noise else self._meter(each, celsius, stuck)
+        np.multiply(mean, np.float32(line.slope), out=self._variance)
+        self._variance += np.float32(line.dark)
+        np.maximum(self._variance, np.float32(line.least), out=self._variance)
         self._unwrap(bad)
         depth = np.empty(len(bad), np.float32)
         float32.finish(
@@ -154,7 +165,7 @@ class Decoder:
         )  # fmt: skip
         shape = self.info.camera.shape
         image = depth.reshape(shape)
-        flags = self._flags(saturated).reshape(shape)
+        flags = self._flags(stuck, saturated).reshape(shape)
         flags |= flying_pixels(image, self.info.camera, self._scratch).view(np.uint8) * np.uint8(
             TofFlag.FLYING
         )
@@ -177,37 +188,39 @@ class Decoder:
             self._weight, self._which.reshape(shape), self._doubt.reshape(shape),
         )  # fmt: skip
 
-    def _flags(self, saturated: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    def _flags(self, stuck: NDArray[np.bool_], saturated: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Raise all flags (H W,) but those of flying pixels."""
         flags = saturated.view(np.uint8) * np.uint8(TofFlag.SATURATED)
         flags |= self._doubt.view(np.uint8) * np.uint8(TofFlag.AMBIGUOUS)
         float32.dim(self._power, self._variance, self._uncertain, int(TofFlag.LOW_CONFIDENCE), flags)
+        shape = self.info.camera.shape
+        odd = [np.zeros(n, np.int32) for n in shape]
         for power, (first, count) in zip(self._power, self._spare, strict=True):
             if count:
                 spare = self._taps[first : first + count]
-                noisier = np.float32(_rare(count) * self._noisier(spare, power, saturated))
                 float32.inconsistent(
-                    spare, power, self._variance, saturated, np.float32(_rare(count)), noisier, _GROSS,
-                    int(TofFlag.INCONSISTENT), flags,
+                    spare, power, self._variance, saturated, np.float32(_rare(count)), np.float32(_odd(count)),
+                    np.float32(self._noisier(spare, power, saturated)), _GROSS, int(TofFlag.INCONSISTENT), flags, *odd,
                 )  # fmt: skip
-        self._broken_lines(flags.reshape(self.info.camera.shape), saturated)
+                rows, columns = (_broken(*each) for each in zip(odd, shape[::-1], strict=True))
+                stuck = stuck | rows[:, None] | columns if rows.any() or columns.any() else stuck
+        if stuck.any():
+            flags |= np.uint8(TofFlag.INCONSISTENT) * (stuck.ravel() & ~saturated)
         return flags
-
-    def _broken_lines(self, flags: NDArray[np.uint8], saturated: NDArray[np.bool_]) -> None:
-        """Flag rows and columns of flags (H, W) whole where many pixels are inconsistent: some of a stuck tap's values are right by chance."""
-        bit = np.uint8(TofFlag.INCONSISTENT)
-        off, sound = (flags & bit) > 0, ~saturated.reshape(flags.shape)
-        if np.count_nonzero(off) > _BROKEN * min(flags.shape):
-            for axis in (0, 1):
-                lines = off.sum(axis=axis) > _BROKEN * np.maximum(sound.sum(axis=axis), 4)
-                flags |= bit * (sound & np.expand_dims(lines, axis))
 
     def _noisier(self, spare: Float32, power: Float32, saturated: NDArray[np.bool_]) -> float:
         """Tell how many times the variance that the noise model says this frame has, by the median of what no cosine explains."""
-        some, count = slice(None, None, _SAMPLE), len(spare)
+        some, count = self._meter.some, len(spare)
         lit = ~saturated[some] & (power[some] > 0)
         ratio = (np.square(spare[:, some]).sum(axis=0) / self._variance[some])[lit]
-        return max(1.0, float(np.median(ratio)) / (count * (1 - 2 / (9 * count)) ** 3)) if len(ratio) else 1.0
+        return max(1.0, middle(ratio) / (count * median_of_chi_squared(count)))
+
+
+def _broken(odd: NDArray[np.int32], pixels: int) -> NDArray[np.bool_]:
+    """Find lines of so many pixels in which more are odd than noise makes: some of a stuck tap's values are right by chance."""
+    most = (_ODD + _BROKEN) * pixels + 3.5 * np.sqrt(_ODD * (1 - _ODD) * max(pixels, 4))
+    out: NDArray[np.bool_] = odd > most
+    return out
 
 
 def flying_pixels(

@@ -6,6 +6,7 @@ machine.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -151,6 +152,12 @@ class Correction:
         self.plain = not (error.harmonics or error.scale)
         self.dark = error.per_inverse_amplitude / self.step
 
+    def of(self, pixels: NDArray[np.intp]) -> Correction:
+        """Return the same for some pixels (n,) only."""
+        some = copy(self)
+        some.fixed = self.fixed[pixels]
+        return some
+
     def __call__(self, real: Float32, imag: Float32, celsius: float, power: Float32, out: Float32) -> None:
         """Turn phasors (N,) into power, raw units squared, and ranges in [0, R], metres."""
         drift = self.per_kelvin * (celsius - self.reference)
@@ -232,15 +239,23 @@ def choose(
         for i in range(m):
             inverse[i] = _ONE / (inverse[i] + _TINY)
         for j in range(len(tops)):
-            cost[:] = np.float32(0)
             if top == 1:  # no sum of what cancels: the one difference between the two
                 w0, e0, period, inverse_period = w[0], e[0], U[0], _ONE / U[0]
                 for i in range(m):
                     x = e0[i] - tops[j]
                     x -= period * np.floor(x * inverse_period + _HALF)
                     cost[i] = x * x * w0[i]
+            elif top == 2:  # as below, in one pass
+                w0, e0, w1, e1 = w[0], e[0], w[1], e[1]
+                U0, U1, inverse0, inverse1 = U[0], U[1], _ONE / U[0], _ONE / U[1]
+                for i in range(m):
+                    x, z = e0[i] - tops[j], e1[i] - tops[j]
+                    x -= U0 * np.floor(x * inverse0 + _HALF)
+                    z -= U1 * np.floor(z * inverse1 + _HALF)
+                    y, t = w0[i] * x, w1[i] * z
+                    cost[i] = y * x + t * z - (y + t) * (y + t) * inverse[i]
             else:
-                linear[:] = np.float32(0)
+                cost[:] = linear[:] = np.float32(0)
                 for k in range(top):
                     wk, ek, period, inverse_period = w[k], e[k], U[k], _ONE / U[k]
                     for i in range(m):
@@ -420,18 +435,44 @@ def dim(power: Float32, variance: Float32, limits: Float32, bit: int, flags: NDA
 
 @compiled
 def inconsistent(
-    spare: Float32, power: Float32, variance: Float32, saturated: Any, rare: Real, noisier: Real, gross: Real, bit: int,
-    flags: NDArray[np.uint8],
+    spare: Float32, power: Float32, variance: Float32, saturated: Any, rare: Real, odd: Real, noisier: Real, gross: Real, bit: int,
+    flags: NDArray[np.uint8], rows: Any, columns: Any,
 ) -> None:  # fmt: skip
-    """Flag pixels (N,) in which the sum of squares of ``spare`` (R, N) is beyond noise; limits are chi squared, and a share of power."""
+    """Flag pixels (N,) in which the sum of squares of ``spare`` (R, N) is beyond noise, and count odd ones in each row and column.
+
+    ``rare`` and ``odd`` are chi squared that noise seldom and sometimes exceeds, ``noisier`` how many times its variance the frame has,
+    ``gross`` a share of power.
+    """
     n = spare.shape[1]
     misfit = np.zeros(n, np.float32)
     for row in range(spare.shape[0]):
         own = spare[row]
         for i in range(n):
             misfit[i] += own[i] * own[i]
-    for i in range(n):
-        limit, most, least = variance[i] * noisier, power[i] * gross, variance[i] * rare
-        limit = min(limit, most)
-        limit = max(least, limit)
-        flags[i] |= np.uint8(bit if (misfit[i] > limit) & (not saturated[i]) else 0)
+    W = len(columns)
+    rows[:] = columns[:] = 0
+    for v in range(len(rows)):
+        count = 0
+        for u in range(W):
+            i = v * W + u
+            noise, most = variance[i] * noisier, power[i] * gross
+            limit = max(variance[i] * rare, min(noise * rare, most))
+            flags[i] |= np.uint8(bit if (misfit[i] > limit) & (not saturated[i]) else 0)
+            strange = 1 if (misfit[i] > noise * odd) & (not saturated[i]) else 0
+            count += strange
+            columns[u] += strange
+        rows[v] = count
+
+
+@compiled
+def repeated(taps: NDArray[Any], step: int, lines: Any) -> None:
+    """Note rows (H,) of taps (K, H, W) along which some taps, not most, say the same in every ``step``-th pixel: they are stuck."""
+    K, H, W = taps.shape
+    for v in range(H):
+        same = 0
+        for k in range(K):
+            u = step
+            while u < W and taps[k, v, u] == taps[k, v, 0]:
+                u += step
+            same += 1 if u >= W else 0
+        lines[v] = 0 < same <= K // 2
