@@ -16,7 +16,7 @@ detected; ``tofcapture calibrate coverage`` says more afterwards.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from tofcapture.camera import Camera
 from tofcapture.channels import SPEED_OF_LIGHT, frequencies, unambiguous
 from tofcapture.frames import ArmState, StereoFrame, TofBurst, TofInfo
 from tofcapture.meshes import inside
-from tofcapture.ops.phase import Complex128, mean_phasors
+from tofcapture.ops.phase import Complex128, Decoder, mean_phasors
 from tofcapture.poses import Float64, invert, rotation_angle, transform, transform_points
 from tofcapture.rig import Rig
 
@@ -77,6 +77,7 @@ _DULL = "lengthen the exposure, come nearer, or leave such objects out"
 _ORDER = (
     "frequencies swapped, or phases in another order or sign: tofcapture calibrate phase-order finds them"
 )
+_OFFSET = "nobody calibrated it: tofcapture calibrate range, once there are views of the board"
 _REACH = "come nearer, state the camera's reach, or use one more or a lower frequency"
 # fmt: off
 LIMITS = (
@@ -92,6 +93,7 @@ LIMITS = (
     Limit("frame_drops", 0, RETAKE, "{0:.0f} frames were dropped within the burst", _LINK),
     Limit("flicker", 0.03, RETAKE, "the light changed by {0:.1%} between the frames", "keep people and lamps out of sight; shade the sun"),
     Limit("saturated", 0.05, NOTE, "{0:.0%} of the ToF pixels are saturated", "shorten the exposure; dull what shines"),
+    Limit("offset_m", 0.02, NOTE, "the frequencies' ranges differ by {0:.3f} m, which bends depth and may cost wraps", _OFFSET),
     Limit("dark", 0.5, NOTE, "{0:.0%} of the ToF pixels are too dark for 20 mm", _DULL),
     Limit("overlap", 0.3, NOTE, "the stereo camera covers {0:.0%} of the ToF image", _RANGE, least=True),
 )
@@ -124,6 +126,7 @@ def measure(
         "stereo_coverage": float(np.isfinite(stereo.points[..., 2]).mean()),
         "overlap": _overlap(stereo, rig),
         "misfit": _misfit(tof, phasor),
+        "offset_m": _offset(tof, rig),
         **_against_stereo(phasor, info, stereo, rig),
     }
     if len(tof.raw) >= 3:
@@ -201,6 +204,16 @@ def _misfit(tof: TofBurst, phasor: Complex128) -> float:
         if len(k) > 2 + info.offset and lit.sum() > _FEW:
             left.append(float(np.median(np.sqrt(np.square(rest).mean(axis=0))[lit] / np.abs(z)[lit])))
     return max(left)
+
+
+def _offset(tof: TofBurst, rig: Rig) -> float:
+    """Metres between the ranges of the frequencies that the rig, or the camera, knows nothing of."""
+    info = tof.info
+    if len(frequencies(info.modulation_hz)) == 1:
+        return 0.0
+    decoder = Decoder(replace(info, range_errors=rig.range_errors or info.range_errors), min_amplitude=_BRIGHT)
+    celsius = float(np.mean(tof.celsius))
+    return abs(decoder.signals(tof.raw.mean(axis=0, dtype=np.float64), celsius)[1].offset)
 
 
 def _against_stereo(phasor: Complex128, info: TofInfo, stereo: StereoFrame, rig: Rig) -> dict[str, float]:

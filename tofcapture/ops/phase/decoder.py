@@ -65,6 +65,16 @@ class Signals:
         out: Float32 = self.ranges[0] - self.ranges[-1]
         return out
 
+    @property
+    def offset(self) -> float:
+        """Largest median by which a frequency's ranges differ from the highest one's, metres: what nobody calibrated; 0 without light.
+
+        Wraps are those that agree best: an offset beyond half of what two of them differ by looks like a smaller one.
+        """
+        apart = (self.ranges[:-1] - self.ranges[-1]).reshape(len(self.ranges) - 1, -1)
+        medians = [middle(each[np.isfinite(each)]) for each in apart]
+        return max(medians, key=abs, default=0.0)
+
 
 class Decoder:
     """Decodes raw frames of one camera; its buffers serve one thread.
@@ -118,7 +128,7 @@ class Decoder:
         F, shape = len(self._power), self.info.camera.shape
         phasor = self._taps[: 2 * F].reshape(2, F, *shape).swapaxes(0, 1)
         ranges = self._ranges - self._rounds
-        ranges[:, ~(self._power.min(axis=0) > 0)] = np.nan
+        ranges[:, ~(self._power.min(axis=0) > self._min_power)] = np.nan
         return maps, Signals(np.ascontiguousarray(phasor), ranges.reshape(F, *shape))
 
     def burst(self, raw: NDArray[Any], celsius: float = float("nan")) -> DepthMaps:
