@@ -8,6 +8,7 @@ import pytest
 
 from tests.test_recorder import VIEWS, Bench, _few_candidates, _record, rows
 from tofcapture.camera import Camera
+from tofcapture.channels import ambiguity
 from tofcapture.devices.console import ConsoleOperator
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.files.view import open_view, view_path
@@ -25,7 +26,7 @@ from tofcapture.record.quality import (
     meter,
     quality_table,
 )
-from tofcapture.rig import SPEED_OF_LIGHT, Rig
+from tofcapture.rig import SPEED_OF_LIGHT, RangeError, Rig
 
 __all__ = ["_few_candidates"]  # applies here too
 
@@ -70,7 +71,7 @@ def test_a_good_view_passes():
     """Nothing is said about a good view, and every check has a number."""
     numbers = measure(**_good())
     assert broken_limits(numbers) == []
-    assert set(numbers) == {check.name for check in LIMITS}
+    assert set(numbers) == {check.name for check in LIMITS} | {"offset_m"}
     assert quality_table(numbers)["notes"] == []
 
 
@@ -164,11 +165,28 @@ def test_channels_that_are_not_what_the_driver_states_are_refused(hz):
 
     Only that the frequencies' ranges differ by it is noted.
     """
-    assert _failing(_slanted(hz)) == {"offset_m"}
+    assert _failing(_slanted(hz)) == {"offset"}
     swapped = [4, 5, 6, 7, 0, 1, 2, 3]
     assert "misread" in _failing(_slanted(hz, modulation_hz=swapped))
     assert "misread" in _failing(_slanted(hz, phase_rad=[0, 3, 2, 1, 4, 7, 6, 5]))
     assert "misfit" in _failing(_slanted(hz, phase_rad=[1, 0, 2, 3, 4, 5, 6, 7]))
+
+
+def test_an_offset_between_the_frequencies_is_measured():
+    """What nobody calibrated between 40 and 70 MHz is said to a millimetre; what the camera says of itself is none."""
+    delay = (
+        2.0 * (ambiguity(40e6) - ambiguity(70e6)) / (2 * np.pi)
+    )  # of both phases alike; less the nearest wraps
+    apart = ambiguity(70e6) / 4
+    parts = _slanted((40e6, 70e6))
+    found = measure(**parts)
+    assert found["offset_m"] == pytest.approx(abs(delay - apart * np.rint(delay / apart)), abs=0.001)
+    info = parts["tof"].info
+    known = replace(
+        info, range_errors=tuple(RangeError(f, 2.0 * ambiguity(f) / (2 * np.pi)) for f in (40e6, 70e6))
+    )
+    parts["tof"] = replace(parts["tof"], info=known)
+    assert measure(**parts)["offset_m"] < 0.001
 
 
 def test_a_scene_out_of_reach_is_refused():
@@ -192,7 +210,7 @@ def test_dark_is_noted_and_unlit_is_refused():
 
 def test_refusals_come_first_and_speak():
     """The gravest failure is first; each has a sentence and a remedy."""
-    numbers = {check.name: 0.0 if check.least else 1e3 for check in LIMITS}
+    numbers = {check.name: 0.0 if check.least else 1e3 for check in LIMITS} | {"offset_m": 1.0}
     failed = broken_limits(numbers)
     assert len(failed) == len(LIMITS)
     order = [check.action for check in failed]
@@ -321,7 +339,7 @@ def test_a_burst_of_one_frame():
     one = replace(tof, raw=tof.raw[:1], time_ns=tof.time_ns[:1], celsius=tof.celsius[:1])
     numbers = measure(**{**parts, "tof": one, "frames": 1})
     assert broken_limits(numbers) == []
-    assert set(numbers) == {check.name for check in LIMITS} - {"flicker"}
+    assert set(numbers) == {check.name for check in LIMITS} - {"flicker"} | {"offset_m"}
 
 
 # What the board views cover so far, from the arm's poses alone.

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.channels import SPEED_OF_LIGHT, frequencies, unambiguous
+from tofcapture.channels import SPEED_OF_LIGHT, frequencies, mismatch, unambiguous
 from tofcapture.frames import ArmState, StereoFrame, TofBurst, TofInfo
 from tofcapture.meshes import inside
 from tofcapture.ops.phase import Complex128, Decoder, mean_phasors
@@ -65,7 +65,7 @@ class Limit:
 
     def sentence(self, numbers: dict[str, float]) -> str:
         """Say what is wrong with a view of these numbers."""
-        return self.words.format(numbers[self.name])
+        return self.words.format(numbers[self.name], **numbers)
 
 
 _SETTLE = "let it settle longer; look for vibration"
@@ -93,7 +93,7 @@ LIMITS = (
     Limit("frame_drops", 0, RETAKE, "{0:.0f} frames were dropped within the burst", _LINK),
     Limit("flicker", 0.03, RETAKE, "the light changed by {0:.1%} between the frames", "keep people and lamps out of sight; shade the sun"),
     Limit("saturated", 0.05, NOTE, "{0:.0%} of the ToF pixels are saturated", "shorten the exposure; dull what shines"),
-    Limit("offset_m", 0.02, NOTE, "the frequencies' ranges differ by {0:.3f} m, which bends depth and may cost wraps", _OFFSET),
+    Limit("offset", 0.08, NOTE, "the frequencies' ranges differ by {offset_m:.3f} m, {0:.0%} of what another wrap makes", _OFFSET),
     Limit("dark", 0.5, NOTE, "{0:.0%} of the ToF pixels are too dark for 20 mm", _DULL),
     Limit("overlap", 0.3, NOTE, "the stereo camera covers {0:.0%} of the ToF image", _RANGE, least=True),
 )
@@ -103,7 +103,7 @@ LIMITS = (
 def measure(
     tof: TofBurst, stereo: StereoFrame, before: ArmState, after: ArmState, rig: Rig, frames: int
 ) -> dict[str, float]:
-    """Find the number of each of :data:`LIMITS`, by name; ``flicker`` only of three frames or more.
+    """Find the number of each of :data:`LIMITS`, by name, and ``offset_m``; ``flicker`` only of three frames or more.
 
     ``before`` and ``after`` are the arm's states before the first and after the last exposure, ``rig`` counts the overlap,
     ``frames`` ToF frames were asked for.
@@ -126,7 +126,7 @@ def measure(
         "stereo_coverage": float(np.isfinite(stereo.points[..., 2]).mean()),
         "overlap": _overlap(stereo, rig),
         "misfit": _misfit(tof, phasor),
-        "offset_m": _offset(tof, rig),
+        **_offset(tof, rig),
         **_against_stereo(phasor, info, stereo, rig),
     }
     if len(tof.raw) >= 3:
@@ -206,14 +206,14 @@ def _misfit(tof: TofBurst, phasor: Complex128) -> float:
     return max(left)
 
 
-def _offset(tof: TofBurst, rig: Rig) -> float:
-    """Metres between the ranges of the frequencies that the rig, or the camera, knows nothing of."""
-    info = tof.info
-    if len(frequencies(info.modulation_hz)) == 1:
-        return 0.0
-    decoder = Decoder(replace(info, range_errors=rig.range_errors or info.range_errors), min_amplitude=_BRIGHT)
-    celsius = float(np.mean(tof.celsius))
-    return abs(decoder.signals(tof.raw.mean(axis=0, dtype=np.float64), celsius)[1].offset)
+def _offset(tof: TofBurst, rig: Rig) -> dict[str, float]:
+    """Find what ranges of the frequencies differ by, beyond what rig or camera know: metres, and a share of the closest wraps' distance."""
+    info = replace(tof.info, range_errors=rig.range_errors or tof.info.range_errors)
+    decoder = Decoder(info, min_amplitude=_BRIGHT)
+    raw, celsius = tof.raw.mean(axis=0, dtype=np.float64), float(np.mean(tof.celsius))
+    offsets = decoder.signals(raw, celsius)[1].offsets
+    share = float(mismatch(offsets, frequencies(info.modulation_hz))) / decoder.wraps.apart
+    return {"offset": share, "offset_m": float(np.abs(offsets).max())}
 
 
 def _against_stereo(phasor: Complex128, info: TofInfo, stereo: StereoFrame, rig: Rig) -> dict[str, float]:

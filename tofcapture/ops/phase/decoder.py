@@ -66,14 +66,13 @@ class Signals:
         return out
 
     @property
-    def offset(self) -> float:
-        """Largest median by which a frequency's ranges differ from the highest one's, metres: what nobody calibrated; 0 without light.
+    def offsets(self) -> NDArray[np.float64]:
+        """Medians by which ranges of each frequency differ from the highest one's, (F,) metres: what nobody calibrated; 0 without light.
 
         Wraps are those that agree best: an offset beyond half of what two of them differ by looks like a smaller one.
         """
-        apart = (self.ranges[:-1] - self.ranges[-1]).reshape(len(self.ranges) - 1, -1)
-        medians = [middle(each[np.isfinite(each)]) for each in apart]
-        return max(medians, key=abs, default=0.0)
+        apart = (self.ranges - self.ranges[-1]).reshape(len(self.ranges), -1)
+        return np.array([middle(each[np.isfinite(each)]) for each in apart])
 
 
 class Decoder:
