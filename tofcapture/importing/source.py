@@ -25,7 +25,7 @@ from tofcapture.importing.said import Facts, Said
 from tofcapture.poses import Float64
 
 Role = Literal["", "raw", "truth", "pose", "other"]
-READERS = ("bags", "arrays", "images", "clouds")
+READERS = ("bags", "bop", "arrays", "images", "clouds")
 """Modules of :mod:`tofcapture.importing.readers`, asked in this order; the first that claims a path reads it."""
 
 

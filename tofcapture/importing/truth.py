@@ -147,6 +147,7 @@ def _of_points(
 def _of_surface(values: NDArray[Any], view: Planned, said: Said, pinhole: Camera, where: str) -> PointMap:
     """See points (N, 3), or triangles (M, 3, 3), with the ToF camera: the nearest in each pixel; meshes at twice its resolution."""
     T, T_world = said.transform("T_tof_truth"), said.transform("T_world_truth")
+    T = view.T_tof_truth if T is None else T
     if T is None and view.T_world_tof is not None:
         T = invert(view.T_world_tof) @ (np.eye(4) if T_world is None else T_world)
     if T is None:

@@ -203,13 +203,13 @@ def camera_of_table(low: Mapping[str, Any], where: str) -> dict[str, Any] | None
     model = str(low.get("distortion_model", low.get("model", low.get("camera_model", "")))).lower()
     if "fl_x" in low:  # nerfstudio and instant-ngp: centres at halves
         fx, cx, cy = (float(low[k]) for k in ("fl_x", "cx", "cy"))
-        K = (fx, float(low.get("fl_y", fx)), cx - 0.5, cy - 0.5)
+        K: tuple[float, ...] = (fx, float(low.get("fl_y", fx)), cx - 0.5, cy - 0.5)
         lens: Sequence[float] = [float(low.get(k, 0.0)) for k in ("k1", "k2", "p1", "p2", "k3")]
         if model == "opencv_fisheye":
             lens = [float(low.get(k, 0.0)) for k in ("k1", "k2", "k3", "k4")]
     elif set(ORDER) <= low.keys():
         K = tuple(float(low[k]) for k in ORDER)
-        held = next(
+        held: Any = next(
             (low[k] for k in LENS if k in low),
             [low.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")],
         )
