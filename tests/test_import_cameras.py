@@ -200,6 +200,18 @@ def test_a_fisheye_is_a_rational_lens_over_the_image(tmp_path, lens):
     assert np.abs(pixels - seen).max() < 0.02
 
 
+@pytest.mark.parametrize("form", ["named", "flat", "list"])
+def test_a_rational_lens_stays_whole(tmp_path, form):
+    """Eight coefficients by name, as Azure Kinect's tools write them, or in OpenCV's order."""
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    lens = (0.5, -2.4, 1e-4, -7e-5, 1.3, 0.4, -2.2, 1.2)
+    table = {"width": 640, "height": 576, "fx": 504.0, "fy": 504.1, "cx": 320.1, "cy": 331.2}
+    named = dict(zip(names, lens, strict=True))
+    table |= {"named": {"distortion": named}, "flat": named, "list": {"distortion": list(lens)}}[form]
+    (tmp_path / "c.json").write_text(json.dumps(table))
+    assert camera_from(camera_keys(str(tmp_path / "c.json")), "").distortion == lens
+
+
 WRONG = {
     "empty.yaml": (text(""), FormatError, "expected a camera"),
     "other.yaml": (text("frames: 3\nname: tof\n"), FormatError, "frames, name"),

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofcapture.camera import LENS_NAMES
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.importing.cameras.trees import read_tree
 from tofcapture.poses import Float64, check_transform, invert
@@ -56,6 +57,9 @@ _SAME = (
     "opencv",
     "full_opencv",
     "pinhole",
+    "simple_pinhole",
+    "simple_radial",
+    "radial",
     "perspective",
     "brown",
     "none",
@@ -207,15 +211,15 @@ def camera_of_table(low: Mapping[str, Any], where: str) -> dict[str, Any] | None
         lens: Sequence[float] = [float(low.get(k, 0.0)) for k in ("k1", "k2", "p1", "p2", "k3")]
         if model == "opencv_fisheye":
             lens = [float(low.get(k, 0.0)) for k in ("k1", "k2", "k3", "k4")]
+        elif float(low.get("k4", 0.0)):
+            raise ConfigError(
+                f"{where}: expected a lens of OpenCV's model, got a fourth radial term",
+                hint="fit it with k1, k2, k3",
+            )
     elif set(ORDER) <= low.keys():
         K = tuple(float(low[k]) for k in ORDER)
-        held: Any = next(
-            (low[k] for k in LENS if k in low),
-            [low.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")],
-        )
-        lens = (
-            [held.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")] if _is_named(held) else _numbers(held)
-        )
+        held: Any = next((low[k] for k in LENS if k in low), low)
+        lens = [float(held.get(k, 0.0)) for k in LENS_NAMES] if _is_named(held) else _numbers(held)
     else:
         matrix = next((low[k] for k in MATRIX if k in low and _is_matrix(low[k])), None)
         if matrix is None:
@@ -286,7 +290,7 @@ def _binned(
     K: Sequence[float], size: tuple[int, int] | None, low: Mapping[str, Any]
 ) -> tuple[tuple[float, ...], tuple[int, int] | None]:
     """Apply the binning and region of interest of a ROS CameraInfo: K is of the full image."""
-    roi = low.get("roi") or {}
+    roi: Mapping[str, Any] = low.get("roi") or {}
     ax, ay = (max(int(low.get(f"binning_{c}", 0)), 1) for c in "xy")
     x0, y0 = (float(roi.get(f"{c}_offset", 0)) for c in "xy")
     w, h = (int(roi.get(n, 0)) for n in ("width", "height"))
@@ -354,7 +358,7 @@ def _colmap(model: tuple[str, str], w: int, h: int, values: Sequence[float], whe
     keys = {"width": w, "height": h, "fx": fx, "fy": fy, "cx": told["cx"] - 0.5, "cy": told["cy"] - 0.5}
     if "FISHEYE" in name:
         return Found(_with_lens(keys, "fisheye", [told.get(f"k{i}", 0.0) for i in range(1, 5)], where))
-    lens = [told.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
+    lens = [told.get(k, 0.0) for k in LENS_NAMES]
     return Found(_with_lens(keys, "", lens, where))
 
 
