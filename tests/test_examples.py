@@ -88,6 +88,15 @@ def cells():
     return ["".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code"]
 
 
+def test_own_camera():
+    """The template of a driver keeps the contract, in at most sixty lines."""
+    script = EXAMPLES / "own_camera.py"
+    ran = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert "keeps the contract" in ran.stdout
+    assert len(script.read_text().splitlines()) <= 60
+
+
 def test_the_notebook_is_one():
     """It is listed, valid, holds no outputs, and every public name that it calls is there."""
     assert NOTEBOOK.name in (EXAMPLES / "README.md").read_text()

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError, FormatError
+from tofcapture.files.camera_bytes import unpack_y12p, with_sign
 from tofcapture.importing.said import Facts, Said
 
 Images = NDArray[Any]  # (n, H, W)
@@ -98,12 +99,6 @@ def decode(data: bytes, name: str, shape: tuple[int, ...], where: str) -> Images
     return np.concatenate(parts)
 
 
-def _twelve_bits(data: bytes) -> NDArray[Any]:
-    """Unpack Y12P: two pixels in three bytes, the high ones first."""
-    b = np.frombuffer(data, np.uint8).reshape(-1, 3).astype(np.uint16)
-    return np.stack([b[:, 0] << 4 | b[:, 2] & 15, b[:, 1] << 4 | b[:, 2] >> 4], axis=1).reshape(-1)
-
-
 def _ten_bits(data: bytes) -> NDArray[Any]:
     """Unpack RAW10: four pixels in five bytes, the high ones first."""
     b = np.frombuffer(data, np.uint8).reshape(-1, 5).astype(np.uint16)
@@ -111,19 +106,13 @@ def _ten_bits(data: bytes) -> NDArray[Any]:
     return (b[:, :4] << 2 | low).reshape(-1)
 
 
-def _with_sign(values: NDArray[Any], bits: int) -> NDArray[np.int16]:
-    half = 1 << (bits - 1)
-    out: NDArray[np.int16] = ((values.astype(np.int32) & (2 * half - 1) ^ half) - half).astype(np.int16)
-    return out
-
-
 def _b0410(data: bytes, size: tuple[int, int]) -> Images:
-    return _with_sign(_twelve_bits(data), 11).reshape(-1, *size)
+    return with_sign(unpack_y12p(data), 11).reshape(-1, *size)
 
 
 def _b0548(data: bytes, size: tuple[int, int]) -> Images:
     H, W = size
-    words = np.frombuffer(data, "<u2") if len(data) % (W * 2405 * 2) == 0 else _twelve_bits(data)
+    words = np.frombuffer(data, "<u2") if len(data) % (W * 2405 * 2) == 0 else unpack_y12p(data)
     return np.concatenate([_four_of(half, H) for half in words.reshape(-1, 2405, W)])
 
 
@@ -211,7 +200,7 @@ def _words(data: bytes, size: tuple[int, int]) -> Images:
 
 
 def _opt8241(data: bytes, size: tuple[int, int]) -> Images:
-    return _with_sign(_words(data, size), 12)
+    return with_sign(_words(data, size), 12)
 
 
 _ORBBEC = "9 images after a header; the frequencies of the other two thirds and the phases, where each image has no header of its own"
@@ -240,6 +229,6 @@ LAYOUTS = {
         "Luxonis OAK-ToF, raw10 of 1280 x 962, two frequencies in turn", (1539200, 2462720), _luxonis, (480, 640), (80, 100), _QUARTERS, 1023,
         guessed="the embedded lines come first",
     ),
-    "espros": Layout("ESPROS, four images of 16 bits; flags from 64000", (), _words, None, (), _QUARTERS, 64000),
+    "espros": Layout("ESPROS, four images of 16 bits; flags from 64000", (), _words, None, (), (0, 270, 180, 90), 64000),
     "ti-opt8241": Layout("TI OPT8241, I and Q of 12 bits", (), _opt8241, (240, 320), (40, 70), (0, 270), 2047, offset=False),
 }  # fmt: skip
