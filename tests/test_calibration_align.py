@@ -290,7 +290,7 @@ def test_same_recording_gives_the_same_bytes(recording, aligned):
 
 def test_recording_without_board_views_says_what_to_do(tmp_path):
     """An empty recording is a data error whose hint is the command that fills it."""
-    with pytest.raises(DataError, match="calibration views") as caught:
+    with pytest.raises(DataError, match="views of the board") as caught:
         align(tmp_path)
     assert "record --calibration" in caught.value.hint
 

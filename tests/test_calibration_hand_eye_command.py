@@ -81,7 +81,7 @@ def test_a_recording_of_too_few_views_is_refused(recorded, tmp_path):
         path.symlink_to(view_path(root, "calibration", i))
     with pytest.raises(QualityError, match="at least 3 views"):
         calibrate("hand-eye", tmp_path)
-    with pytest.raises(DataError, match="calibration views") as caught:
+    with pytest.raises(DataError, match="views of the board") as caught:
         calibrate("hand-eye", tmp_path / "views")
     assert "record --calibration" in caught.value.hint
 
