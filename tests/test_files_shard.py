@@ -313,7 +313,7 @@ def test_manifest_round_trip_and_validation(tmp_path):
         with pytest.raises(DataError, match=r"manifest\.json"):
             load_manifest(tmp_path)
     path.unlink()
-    with pytest.raises(DataError, match="cannot read"):
+    with pytest.raises(DataError, match="expected a dataset"):
         load_manifest(tmp_path)
 
 
