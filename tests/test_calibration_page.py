@@ -297,7 +297,7 @@ def test_align_goes_on_without_the_page(recording, monkeypatch):
     (recording / "evidence.html").write_text("old")
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "jinja2", None)
-        path, reason = _page(recording, None, read_evidence(recording), lambda *_: None)
+        path, reason = _page(recording, recording, None, read_evidence(recording), lambda *_: None)
     assert path is None
     assert "jinja2" in reason
     assert not (recording / "evidence.html").exists()

@@ -151,7 +151,7 @@ def test_a_daemon_gets_the_work(daemon, tmp_path, capsys):
     words = ["record", "--scene", "mug", "--views", "2", "--frames", "3", "--seed", "5"]
     assert main([*words, "--out", str(tmp_path / "r")]) == 0
     assert "job 7" in capsys.readouterr().out
-    request = {"scene": "mug", "views": 2, "frames": 3, "seed": 5, "recording": "r"}
+    request = {"scene": "mug", "views": 2, "frames": 3, "seed": 5, "recording": "r", "clear": False}
     assert daemon[-1] == ("POST", "/v1/jobs", request)
     assert not (tmp_path / "r").exists()
 
