@@ -12,7 +12,9 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("tofcapture", "calibration", "tofcapture_model")
 GROUPS = ("tofcapture.commands", "tofcapture.drivers")  # of entry points
 MOST = 12  # modules in a folder, ``__init__`` apart
-PAGES = sorted([*(p for p in (ROOT / "docs").rglob("*.md") if "reference" not in p.parts), ROOT / "README.md"])
+PAGES = sorted(
+    [*(p for p in (ROOT / "docs").rglob("*.md") if "reference" not in p.parts), ROOT / "README.md"]
+)
 NAME = re.compile(r"`((?:tofcapture|calibration|tofcapture_model)(?:\.\w+)+)`")
 FILE = re.compile(r"`((?:tofcapture|calibration|tofcapture_model|tests|benchmarks|examples|docs)/[\w./-]*)`")
 
