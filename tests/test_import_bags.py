@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import shutil
 import struct
 
 import cv2
@@ -367,3 +368,25 @@ def test_a_damaged_bag_is_named(tmp_path, form):
     with pytest.raises(TofError, match=r"cannot read the (bag|MCAP)") as info:
         import_data([path], tmp_path / "rec", Said())
     assert "reindex" in info.value.hint
+
+
+def test_a_folder_of_bags_has_a_scene_each_and_knows_them_again(tmp_path):
+    """The same bags are imported once; one that was recorded anew under its name is refused."""
+    (tmp_path / "bags").mkdir()
+    for name, form in (("mug", "mcap"), ("box", "ros1")):
+        written(tmp_path / "bags" / name, form, views=2)
+    import_data([tmp_path / "bags"], tmp_path / "rec", Said())
+    assert {scene: len(views) for scene, views in find_views(tmp_path / "rec").items()} == {
+        "box": 2,
+        "mug": 2,
+    }
+    assert import_data([tmp_path / "bags"], tmp_path / "rec", Said()).skipped == ["box", "mug"]
+    shutil.rmtree(tmp_path / "bags/mug")
+    written(
+        tmp_path / "bags/mug",
+        "mcap",
+        views=2,
+        change=lambda b: b.rows.reverse() or b.tf(START, "a", "b", (0, 0, 1)),
+    )
+    with pytest.raises(TofError, match="is not of these data"):
+        import_data([tmp_path / "bags"], tmp_path / "rec", Said())

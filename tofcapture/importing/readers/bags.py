@@ -100,14 +100,21 @@ def pieces(path: Path, said: Said) -> Iterator[Piece]:
     frame = bag.topics[raw[0]].frame
     if truth and bag.topics[truth].frame:
         T_tof_truth = _between(bag, frame, bag.topics[truth].frame, rows[0][0], said)
+    file = _file(path)
     for i, (time, held, target) in enumerate(rows):
-        pose = _between(bag, "", frame, time, said)
-        yield Piece(
-            f"{raw[0]}/view{i:06d}", path, partial(_stacked, path, held, K, camera), "raw", time, facts, pose
-        )
+        pose, load = _between(bag, "", frame, time, said), partial(_stacked, path, held, K, camera)
+        yield Piece(f"{raw[0]}/view{i:06d}", file, load, "raw", time, facts, pose)
         if truth and target is not None:
             load = partial(_message, path, truth, target)
-            yield Piece(f"{truth}/view{i:06d}", path, load, "truth", time, known, T_tof_truth)
+            yield Piece(f"{truth}/view{i:06d}", file, load, "truth", time, known, T_tof_truth)
+
+
+def _file(path: Path) -> Path:
+    """File whose digest stands for the bag: of a folder its only storage, else what lists them."""
+    if path.is_file():
+        return path
+    held = [p for p in path.iterdir() if p.suffix in {".mcap", ".db3"}]
+    return held[0] if len(held) == 1 else path / "metadata.yaml"
 
 
 def _looked_through(path: Path, said: Said) -> _Bag:

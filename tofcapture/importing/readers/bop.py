@@ -128,7 +128,7 @@ def _truth(scene: Path, number: int, told: Mapping[str, Any], objects: list[Any]
     """File and reader of an image's ground truth: triangles (M, 3, 3) or depth (H, W), millimetres, camera's frame."""
     models = next((p for p in sorted(scene.parent.parent.glob("models*")) if any(p.glob("obj_*.ply"))), None)
     if models and objects:
-        return scene / POSES, partial(_triangles, models, tuple(map(str, (scene / POSES, number))), objects)
+        return scene / POSES, partial(_triangles, models, f"{scene / POSES}: {number}", objects)
     for kind in ("depth_gt", "depth"):
         file = next(iter(sorted(scene.glob(f"{kind}/{number:06d}.*"))), None)
         if file is not None:
@@ -140,15 +140,13 @@ def _scaled(path: Path, scale: float) -> NDArray[Any]:
     return _image(path).astype(np.float32) * np.float32(scale)
 
 
-def _triangles(models: Path, where: tuple[str, str], objects: list[Any]) -> NDArray[Any]:
+def _triangles(models: Path, where: str, objects: list[Any]) -> NDArray[Any]:
     found = []
     for one in objects:
         mesh = models / f"obj_{int(one['obj_id']):06d}.ply"
-        T = _pose(one, "m2c", ": ".join(where))
+        T = _pose(one, "m2c", where)
         if not mesh.is_file() or T is None:
-            raise DataError(
-                f"{where[0]}: expected a model and a pose of object {one['obj_id']}, got no {mesh}"
-            )
+            raise DataError(f"{where}: expected a model and a pose of object {one['obj_id']}, got no {mesh}")
         corners = read_surface(mesh)
         if corners.ndim != 3:
             raise DataError(
