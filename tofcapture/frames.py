@@ -19,6 +19,8 @@ from tofcapture.rig import RangeError, Rig
 
 PAPER_MODULATION_HZ = (20e6,) * 4 + (100e6,) * 4
 PAPER_PHASE_RAD = tuple(float(k) * np.pi / 2 for k in range(4)) * 2
+NO_TRUTH = "none"
+"""Model of the stereo camera of a view without one: its point map is empty, on the ToF camera's grid."""
 CALIBRATION = "calibration"
 """Name of the scene that is the calibration board."""
 

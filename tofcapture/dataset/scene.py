@@ -40,7 +40,7 @@ from tofcapture.files.layout import SHARD, MaskBit
 from tofcapture.files.seal import digest_path, sealed_digest
 from tofcapture.files.shard import Sample, ShardReader, ShardWriter
 from tofcapture.files.view import read_depth_view
-from tofcapture.frames import View
+from tofcapture.frames import NO_TRUTH, View
 from tofcapture.ops.phase import Decoder
 from tofcapture.pool import Pool, one_thread
 from tofcapture.rig import Rig, dumps_rig
@@ -172,6 +172,11 @@ def build_shard(
                 errors += [] if error is None else [error]
                 if progress:
                     progress(len(good))
+            if not seen and first.stereo.info.model == NO_TRUTH:
+                raise DataError(
+                    f"{task.scene}: its views have no ground truth",
+                    hint="tofcapture predict takes them as they are; or import them again with ground truth",
+                )
             if not seen:
                 raise DataError(
                     f"{task.scene}: stereo measured nothing in the ToF camera's image in any of {len(good)} views",

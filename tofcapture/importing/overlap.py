@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from tofcapture.errors import DataError
-from tofcapture.frames import View
+from tofcapture.frames import NO_TRUTH, View
 from tofcapture.importing.rules import Float32
-from tofcapture.importing.truth import NONE, nearest
+from tofcapture.importing.truth import nearest
 from tofcapture.ops.phase import Decoder
 from tofcapture.poses import Float64, transform_points
 
@@ -46,7 +46,7 @@ def compare(view: View, where: str, model: str) -> Overlap:
     """Compare; :class:`DataError` for ground truth that misses the image, or that fits much better mirrored, turned or scaled."""
     decoded = Decoder(view.tof.info).burst(view.tof.raw, float(np.mean(view.tof.celsius)))
     tof = decoded.depth
-    if model == NONE:
+    if model == NO_TRUTH:
         return Overlap(tof, np.full_like(tof, np.nan), decoded.confidence, model)
     truth = seen(view, view.rig.T_tof_stereo)
     found = Overlap(tof, truth, decoded.confidence, model)

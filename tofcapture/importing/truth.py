@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera, distorted
 from tofcapture.errors import ConfigError, DataError
+from tofcapture.frames import NO_TRUTH
 from tofcapture.importing.plan import Planned
 from tofcapture.importing.rules import FARTHEST, NEAREST, Float32, metres
 from tofcapture.importing.said import Said
 from tofcapture.meshes import UNITS
 from tofcapture.poses import Float64, invert, transform_points
 
-NONE = "none"  # model of the camera of a view without ground truth
 _GRID = 0.5  # px that a point map may be off the pinhole that fits it
 _ONE_SURFACE = 0.02  # of depth; neighbours that differ by more are not interpolated
 
@@ -28,7 +28,7 @@ class PointMap:
     points: NDArray[np.float32]  #: (SH, SW, 3) metres; NaN: not measured.
     camera: Camera  #: A pinhole.
     T_tof_stereo: Float64  #: (4, 4)
-    model: str  #: What it was made of; :data:`NONE` when there is no ground truth.
+    model: str  #: What it was made of; :data:`tofcapture.frames.NO_TRUTH` when there is no ground truth.
 
 
 def point_map(view: Planned, said: Said, tof: Camera) -> PointMap:
@@ -39,7 +39,7 @@ def point_map(view: Planned, said: Said, tof: Camera) -> PointMap:
     """
     pinhole = Camera(tof.width, tof.height, tof.fx, tof.fy, tof.cx, tof.cy)
     if view.truth is None:
-        return PointMap(np.full((*tof.shape, 3), np.nan, np.float32), pinhole, np.eye(4), NONE)
+        return PointMap(np.full((*tof.shape, 3), np.nan, np.float32), pinhole, np.eye(4), NO_TRUTH)
     where = view.pieces[-1].name
     values, kind = view.truth(), str(said.truth.get("kind", ""))
     if values.shape[1:] in {(3,), (3, 3)} and len(values) > 3:
@@ -179,9 +179,10 @@ def _cast(triangles: Float64, camera: Camera) -> Float32:
 
     scene = o3d.t.geometry.RaycastingScene()
     corners = np.ascontiguousarray(triangles.reshape(-1, 3), dtype=np.float32)
-    scene.add_triangles(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3))
+    numbers = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+    scene.add_triangles(o3d.core.Tensor(corners), o3d.core.Tensor(numbers))
     rays = np.concatenate([np.zeros_like(camera.rays), camera.rays], axis=-1).astype(np.float32)
-    found: Float32 = scene.cast_rays(rays)["t_hit"].numpy()
+    found: Float32 = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
     return np.where(np.isfinite(found), found, np.float32(np.nan))
 
 

@@ -19,12 +19,12 @@ from tofcapture.files.check import UNFINISHED
 from tofcapture.files.disk import check_writable
 from tofcapture.files.seal import digest_once, fsync, write_text
 from tofcapture.files.view import open_view, view_path, write_view
-from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, View
+from tofcapture.frames import NO_TRUTH, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, View
 from tofcapture.importing.overlap import Overlap, compare
 from tofcapture.importing.plan import Planned, plan
 from tofcapture.importing.rules import burst_mean, check_taps, check_unit, expect_finite, signed
 from tofcapture.importing.said import NAME, Said, read_said
-from tofcapture.importing.truth import NONE, point_map
+from tofcapture.importing.truth import point_map
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig, dumps_rig, load_rig
 
@@ -235,7 +235,7 @@ def _keep_rig(out: Path, rig: Rig, model: str) -> None:
         return
     known = load_rig(path)
     same = _alike(known.tof, rig.tof) and (
-        model == NONE
+        model == NO_TRUTH
         or (_alike(known.stereo, rig.stereo) and np.allclose(known.T_tof_stereo, rig.T_tof_stereo, atol=1e-6))
     )
     if not same:

@@ -112,7 +112,7 @@ def camera_keys(text: str) -> dict[str, Any]:
         raise ConfigError(
             f"--camera: expected at least fx,fy,cx,cy, got {len(numbers)} numbers", hint="pixels"
         )
-    lens = {"distortion": numbers[4:]} if numbers[4:] else {}
+    lens = {"distortion": [*numbers[4:], *(0.0,) * (8 - len(numbers))]} if numbers[4:] else {}
     return {**dict(zip(ORDER, numbers, strict=False)), **lens}
 
 

@@ -41,11 +41,12 @@ def read_surface(path: Path) -> NDArray[Any]:
         ) from err
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     if path.suffix.lower() != ".pcd":
-        mesh = o3d.io.read_triangle_mesh(str(path))
+        mesh = o3d.io.read_triangle_mesh(path)
         if len(mesh.triangles):
-            return np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
+            corners: NDArray[Any] = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
+            return corners
     points = np.asarray(
-        o3d.io.read_point_cloud(str(path), remove_nan_points=True, remove_infinite_points=True).points
+        o3d.io.read_point_cloud(path, remove_nan_points=True, remove_infinite_points=True).points
     )
     if not len(points):
         raise FormatError(
