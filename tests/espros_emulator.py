@@ -39,6 +39,8 @@ class Emulator:
 
     def __exit__(self, *_):
         self.unplug()
+        with contextlib.suppress(OSError):
+            self._tcp.shutdown(socket.SHUT_RDWR)  # wakes who accepts
         self._tcp.close()
         self._udp.close()
 

@@ -258,6 +258,19 @@ def test_the_commands(carried, tmp_path, capsys):
     assert main(["check", str(out)]) == 0
 
 
+def test_a_tripod_with_simulated_cameras(tmp_path):
+    """The command records through the driver as it is registered, real time and all."""
+    path, out = tmp_path / "station.toml", tmp_path / "rec"
+    text = STATION.replace("patience = 30.0\n", "").replace('"carried"\nhold', '"tripod"\nhold')
+    path.write_text(text.replace('"carried"', '"sim"'))
+    command = ["record", "--scene", "mug", "--views", "1", "--frames", "2", "--station", str(path)]
+    assert main([*command, "--out", str(out)]) == 0
+    assert main(["check", str(out)]) == 0
+    view = open_view(find_views(out)["mug"][0])
+    assert view.provenance["simulated"] is False
+    assert view.provenance["arm"] == {"model": "tripod", "serial": "no poses"}
+
+
 class _Tracker:
     """Sends poses to a port, from a thread: ``pose(t)`` after t seconds, with noise; None is silence."""
 

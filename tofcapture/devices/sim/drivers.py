@@ -64,10 +64,13 @@ class _InWorld(Device):
         return shared_world(self._context)
 
     def _present(self) -> tuple[SimWorld, Callable[[], int]]:
-        """Return the world at the arm's pose, and a clock: a real arm is asked, the simulated one has said where it is."""
+        """Return the world at the arm's pose, and a clock; only a real arm is asked."""
         arm = self._context.shared.get("arm")
         if arm is None or arm.simulated:
             return self._world, shared_clock(self._context)
+        if arm.by_hand:  # it asks these cameras where it is: it stands where an arm's home is
+            self._world.set_pose(forward(arm_model("ur10e"), HOME), b"by hand")
+            return self._world, time.monotonic_ns
         state = arm.state()
         self._world.set_pose(state.T_base_flange, state.joints.round(5).tobytes())
         return self._world, time.monotonic_ns
