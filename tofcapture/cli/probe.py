@@ -185,9 +185,9 @@ def probe_station(path: str, opening: str = "") -> Iterator[Finding]:
 
     def open_all() -> str:
         with open_station(file) as station:
-            state = station.arm.state()
             if station.arm.by_hand:
-                return "all open; the rig is moved by hand"
+                return "all open; the rig has no motors"
+            state = station.arm.state()
             if wrong := pose_error(station.arm.kinematics(), state.joints, state.T_base_flange):
                 raise ConfigError(wrong, hint="correct the kinematics: every check of a way rests on them")
             joints = ", ".join(f"{q:.2f}" for q in state.joints)
