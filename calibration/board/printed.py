@@ -23,6 +23,9 @@ STRAY = (
     0.01  # image widths off the homography of all, distortion included, at which a corner is another one's
 )
 SETTLED = 0.2  # px that a fitted corner may still move
+OUTLYING = 6.0  # times the median distance from where all corners say one belongs, at which it is another one's
+LEAST_STRAY = 0.3  # px
+BENDABLE = 24  # corners that tell a lens's bend: ten numbers a coordinate
 
 
 def corners_in(image: NDArray[Any], pattern: Pattern) -> tuple[Float64, Float64]:
@@ -45,10 +48,31 @@ def corners_in(image: NDArray[Any], pattern: Pattern) -> tuple[Float64, Float64]
             hint="whole in the image, evenly lit, sharp; columns and rows count squares, of an AprilGrid tags; the dictionary?",
         )
     pixels = (pixels + 0.5) / larger - 0.5
-    if larger == 1:
-        return pixels, at
-    pixels, settled = _fitted(np.asarray(image, dtype=np.float64), pattern, pixels, at)
-    return (pixels[settled], at[settled]) if settled.sum() >= FEWEST else (pixels, at)
+    if larger > 1 or pattern.kind == "aprilgrid":
+        start = _smooth(pixels, at) if pattern.kind == "aprilgrid" else pixels
+        found, settled = _fitted(np.asarray(image, dtype=np.float64), pattern, start, at)
+        pixels, at = (found[settled], at[settled]) if settled.sum() >= FEWEST else (pixels, at)
+    off = np.linalg.norm(pixels - _smooth(pixels, at), axis=1)
+    good = off < max(OUTLYING * float(np.median(off)), LEAST_STRAY)
+    return pixels[good], at[good]
+
+
+def _smooth(pixels: Float64, at: Float64) -> Float64:
+    """Where corners (N, 2) belong by what all of them say: a plane's image, bent by a lens as a polynomial of third degree."""
+    import cv2
+
+    H, _ = cv2.findHomography(at, pixels)
+    flat = cv2.perspectiveTransform(at[:, None], H)[:, 0]
+    if len(at) < BENDABLE:
+        return np.asarray(flat)
+    x, y = ((at - at.mean(axis=0)) / np.ptp(at, axis=0).max()).T
+    columns = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=-1)
+    off, weight = pixels - flat, np.ones((len(at), 1))
+    for _ in range(10):
+        bend = columns @ np.linalg.lstsq(columns * weight, off * weight, rcond=None)[0]
+        left = np.linalg.norm(off - bend, axis=1, keepdims=True)
+        weight = 1 / (1 + np.square(left / max(2 * float(np.median(left)), 1e-6)))
+    return np.asarray(flat + bend)
 
 
 def _fitted(
@@ -233,12 +257,13 @@ def _charuco(grey: NDArray[np.uint8], pattern: Pattern) -> tuple[Float64, Float6
 
 
 def _april(grey: NDArray[np.uint8], pattern: Pattern) -> tuple[Float64, Float64]:
-    """Find the corners of tags. Libraries start at different corners of a tag: the start that lies on a plane is taken for all."""
+    """Find the corners of tags. Libraries start at different corners of a tag: the start that lies on a plane is taken for all.
+
+    The library's own refinement is not asked: it jumps to the squares that stand between tags.
+    """
     import cv2
 
-    parameters = _parameters(pattern.border)
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(aruco_dictionary(pattern.dictionary), parameters)
+    detector = cv2.aruco.ArucoDetector(aruco_dictionary(pattern.dictionary), _parameters(pattern.border))
     corners, numbers, _ = detector.detectMarkers(grey)
     known = (
         [] if numbers is None else [(c, int(n)) for c, n in zip(corners, numbers.reshape(-1), strict=True)]
