@@ -30,15 +30,14 @@ from calibration.registration.gate import register
 from tofcapture.devices.sim import stereo as stereos
 from tofcapture.devices.sim.config import Constants, read_constants
 from tofcapture.devices.sim.light import Light
-from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, on_table, scene_objects
+from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects
 from tofcapture.devices.sim.sensor import expose
 from tofcapture.devices.sim.stereo import point_map
 from tofcapture.devices.sim.world import SimWorld
-from tofcapture.frames import CALIBRATION, ArmState, StereoFrame, TofBurst, Truth, View
+from tofcapture.frames import ArmState, StereoFrame, TofBurst, Truth, View
 from tofcapture.poses import Float64, invert, look_at, rotation_exp, transform_points
 
 VIEWS = 12
-SCENE_VIEWS = 20  # of a table without a board
 RIG_SPREAD = (0.006, 0.012)  # m, rad: how far the seeds' rigs differ in each component
 FRAMES = 10
 LAMP = {"lamp": {"half_angle": 0.70, "edge": 0.17}}  # of the embedded station
@@ -49,8 +48,8 @@ def constants_of(overrides: dict[str, Any] | None = None) -> Constants:
     return read_constants({**LAMP, **(overrides or {})}, "benchmark")
 
 
-def world_of(pool: int, seed: int, scene: str = CALIBRATION) -> SimWorld:
-    """Make a station of its own: rig, sensors, surroundings, and what stands on its table."""
+def world_of(pool: int, seed: int) -> SimWorld:
+    """Make a station of its own: rig, sensors, surroundings."""
     rng = np.random.default_rng([pool, seed, 7])
     rig = constants_of().rig
     moved = {
@@ -59,7 +58,7 @@ def world_of(pool: int, seed: int, scene: str = CALIBRATION) -> SimWorld:
     }
     own = 1000 * pool + seed
     world = SimWorld(constants_of({"rig": moved}), own, lambda name, _: scene_objects(name, own))
-    world.place(scene)
+    world.place("calibration")
     return world
 
 
@@ -77,19 +76,6 @@ def poses_of(pool: int, seed: int, near: float = 0.5, far: float = 1.1) -> list[
         out.append(
             look_at(target + away * direction, target, up=[1.0, 0.0, 0.0], roll=rng.uniform(-0.5, 0.5))
         )
-    return out
-
-
-def scene_poses(pool: int, seed: int) -> list[Float64]:
-    """``T_base_tof`` of a seed's views of the table: 15 to 60 degrees off the vertical, all round, 0.5 to 1 m away."""
-    rng = np.random.default_rng([pool, seed, 3])
-    out = []
-    for i in range(SCENE_VIEWS):
-        tilt, turn = np.radians(rng.uniform(15, 60)), 2.399963 * i
-        direction = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
-        target = on_table(*rng.uniform(-0.08, 0.08, 2)) + [0.0, 0.0, 0.05]
-        eye = target + rng.uniform(0.5, 1.0) * direction
-        out.append(look_at(eye, target, up=[1.0, 0.0, 0.0], roll=rng.uniform(-0.5, 0.5)))
     return out
 
 

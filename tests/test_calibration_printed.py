@@ -66,6 +66,20 @@ def test_small_images_give_corners_to_hundredths_of_a_pixel(name, roll):
     assert np.linalg.norm(seen.fit.T[:3, 3] - T[:3, 3]) < 0.003
 
 
+@pytest.mark.parametrize("roll", [4, 184])
+def test_large_images_of_tags_hold_no_stray_corner(roll):
+    """Corners of tags do not jump to the squares between them, upright and upside down."""
+    board, camera = load_board("aprilgrid"), Camera(960, 720, 760.0, 765.0, 478.0, 361.0, LENS.distortion)
+    T = pose(board, 25, 40, roll, 0.6)
+    image = cv2.GaussianBlur(image_of(board, camera, T, 2, noise=1.0), (0, 0), 0.6)
+    pixels, at = corners_in(image, board.pattern)
+    true, _ = camera.project(
+        np.column_stack([at, np.full(len(at), board.thickness)]) @ T[:3, :3].T + T[:3, 3]
+    )
+    assert len(at) > 0.7 * len(board.pattern.corners)
+    assert np.abs(pixels - true).max() < 0.2
+
+
 def test_patterns_are_opencvs():
     """What is dark on a ChArUco board of ours is dark on OpenCV's, in both of its layouts."""
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)

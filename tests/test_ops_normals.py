@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tofcapture.camera import Camera
 from tofcapture.errors import DataError
-from tofcapture.ops.normals import PlaneField, grazing, normals_from_depth
+from tofcapture.ops.normals import RADII, PlaneField, grazing, normals_from_depth
 
 CAMERA = Camera(60, 50, 400.0, 405.0, 28.3, 26.1)
 
@@ -135,3 +135,27 @@ def test_depth_of_another_shape_is_refused():
     """The camera says which shape depth must have."""
     with pytest.raises(DataError, match="expected depth of shape"):
         normals_from_depth(np.ones((3, 3)), CAMERA)
+
+
+@given(st.integers(0, 50), st.floats(3.0, 10.0), st.floats(0.0, np.radians(50)))
+@settings(max_examples=5, deadline=None)
+def test_windows_are_large_on_noisy_floors_and_small_on_what_bends(seed, noisier, tilt):
+    """On a floor, half of it many times as noisy, nearly every place has the largest window; on a ball and at creases few have."""
+    camera = Camera(160, 96, 300.0, 300.0, 79.5, 47.5)
+    noise = np.random.default_rng(seed).standard_normal(camera.shape)
+    v, u = (x.reshape(-1) for x in np.mgrid[14:82:2, 14:146:2])
+
+    def widest(depth):
+        field, pixels = PlaneField(depth, camera), np.stack([u, v], axis=1).astype(float)
+        return field.at(pixels)[1] == field.at(pixels, RADII[-1:])[1]  # told by what they leave
+
+    floor = plane(camera, np.array([np.sin(tilt), 0.0, -np.cos(tilt)]))
+    sigma = np.where(np.arange(160) < 112, 5e-4, 5e-4 * noisier) * floor**2
+    assert widest(floor + sigma * noise)[u > 124].mean() > 0.8
+    rays = camera.rays / camera.ray_lengths[..., None]
+    along = 0.8 * rays[..., 2]
+    under = 0.06**2 - 0.8**2 + along**2
+    ball = np.where(under > 0, (along - np.sqrt(np.maximum(under, 0.0))) * rays[..., 2], floor)
+    assert widest(ball + 2e-4 * noise)[under[v, u] > 0].mean() < 0.3
+    crease = 0.8 + np.abs(np.arange(160) - 79.5) / 300.0 + 2e-4 * noise
+    assert widest(crease)[np.abs(u - 79.5) < 6].mean() < 0.1

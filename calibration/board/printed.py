@@ -23,7 +23,9 @@ STRAY = (
     0.01  # image widths off the homography of all, distortion included, at which a corner is another one's
 )
 SETTLED = 0.2  # px that a fitted corner may still move
-OUTLYING = 6.0  # times the median distance from where all corners say one belongs, at which it is another one's
+OUTLYING = (
+    6.0  # times the median distance from where all corners say one belongs, at which it is another one's
+)
 LEAST_STRAY = 0.3  # px
 BENDABLE = 24  # corners that tell a lens's bend: ten numbers a coordinate
 
@@ -204,15 +206,20 @@ def _chessboard(grey: NDArray[np.uint8], pattern: Pattern) -> tuple[Float64, Flo
     columns, rows = pattern.columns - 1, pattern.rows - 1
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
     flags |= cv2.CALIB_CB_LARGER
-    found, seen, squares = cv2.findChessboardCornersSBWithMeta(grey, (columns, rows), flags)
-    if not found:
+    for scale in (1.0, 0.5):  # smooth enlarged images are found when smaller
+        cv2.setRNGSeed(0)  # the library draws, and may else take a part of a board for the whole
+        smaller = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        found, seen, squares = cv2.findChessboardCornersSBWithMeta(smaller, (columns, rows), flags)
+        if found:
+            break
+    else:
         return np.zeros((0, 2)), np.zeros((0, 2))
     if squares.shape not in {(rows, columns), (columns, rows)}:
         raise QualityError(
             f"chessboard of {pattern.columns} x {pattern.rows}: the one in the image has {squares.shape[1] + 1} x {squares.shape[0] + 1}",
             hint="columns and rows count squares, not corners between them",
         )
-    grid = seen.reshape(rows, columns, 2).astype(np.float64)
+    grid = (seen.reshape(rows, columns, 2).astype(np.float64) + 0.5) / scale - 0.5
     orders = [grid, grid[::-1, ::-1], grid[::-1], grid[:, ::-1]]
     if rows == columns:
         orders += [g.swapaxes(0, 1) for g in orders]
