@@ -26,7 +26,7 @@ SETTLED = 0.2  # px that a fitted corner may still move
 OUTLYING = (
     6.0  # times the median distance from where all corners say one belongs, at which it is another one's
 )
-LEAST_STRAY = 0.3  # px
+LEAST_STRAY = 0.15  # px
 BENDABLE = 24  # corners that tell a lens's bend: ten numbers a coordinate
 
 
