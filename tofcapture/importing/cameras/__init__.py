@@ -24,47 +24,19 @@ from tofcapture.poses import Float64, check_transform, invert
 ORDER = ("fx", "fy", "cx", "cy")
 SIZE = (("width", "height"), ("image_width", "image_height"), ("w", "h"), ("cols", "rows"))
 SIZES = ("image_size", "imagesize", "img_size", "resolution", "size", "imagesize_wh", "img_shape")
-MATRIX = (
-    "camera_matrix",
-    "cameramatrix",
-    "camera",
-    "k",
-    "m",
-    "mtx",
-    "intrinsics",
-    "intrinsic",
-    "intrinsic_matrix",
-    "cam_k",
-    "a",
-    "cm",
-)
-LENS = (
-    "distortion_coefficients",
-    "distcoeffs",
-    "dist_coeffs",
-    "distortion",
-    "d",
-    "dist",
-    "distortion_coeffs",
-    "distcoef",
-    "coeffs",
-)
-_SAME = (
-    "",
-    "plumb_bob",
-    "radtan",
-    "rational_polynomial",
-    "opencv",
-    "full_opencv",
-    "pinhole",
-    "simple_pinhole",
-    "simple_radial",
-    "radial",
-    "perspective",
-    "brown",
-    "none",
-)
-_FISHEYE = ("equidistant", "equi", "fisheye", "kannala_brandt", "opencv_fisheye")
+MATRIX = [
+    "camera_matrix", "cameramatrix", "camera", "k", "m", "mtx", "intrinsics", "intrinsic",
+    "intrinsic_matrix", "cam_k", "a", "cm",
+]  # fmt: skip
+LENS = [
+    "distortion_coefficients", "distcoeffs", "dist_coeffs", "distortion", "d", "dist",
+    "distortion_coeffs", "distcoef", "coeffs",
+]  # fmt: skip
+_SAME = [
+    "plumb_bob", "radtan", "rational_polynomial", "opencv", "full_opencv", "pinhole", "simple_pinhole",
+    "simple_radial", "radial", "perspective", "brown", "none",
+]  # fmt: skip
+_FISHEYE = ["equidistant", "equi", "fisheye", "kannala_brandt", "opencv_fisheye"]
 # COLMAP's models by number: name, and what its parameters are.
 _COLMAP = {
     0: ("SIMPLE_PINHOLE", "f cx cy"), 1: ("PINHOLE", "fx fy cx cy"), 2: ("SIMPLE_RADIAL", "f cx cy k1"),
@@ -243,7 +215,7 @@ def _with_lens(keys: dict[str, Any], model: str, lens: Sequence[float], where: s
     """Add a lens of OpenCV's model; refuse others."""
     if model in _FISHEYE:
         lens = _fisheye(keys, lens, where)
-    elif model not in _SAME:
+    elif model and model not in _SAME:
         raise ConfigError(
             f"{where}: expected a lens of OpenCV's model, got {model}",
             hint="fit it again with radtan (Kalibr), plumb_bob or rational_polynomial (ROS), OPENCV or FULL_OPENCV (COLMAP)",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -31,16 +31,13 @@ _NAMED = {
     "bgra8": "8UC4",
 }
 _FOXGLOVE = {
-    "RawImage": "Image",
-    "CompressedImage": "CompressedImage",
-    "CameraCalibration": "CameraInfo",
-    "FrameTransform": "TFMessage",
-}
+    "RawImage": "Image", "CompressedImage": "CompressedImage", "CameraCalibration": "CameraInfo", "FrameTransform": "TFMessage",
+}  # fmt: skip
 _DAMAGED = (
     "ros2 bag reindex, rosbag reindex or mcap recover mend what a killed recorder left; else copy it again"
 )
-Message = tuple[str, str, int, Any]
-"""Topic, type without its package, time of recording in nanoseconds, message."""
+Message = tuple[str, str, int, Callable[[], Any]]
+"""Topic, type without its package, time of recording in nanoseconds, and what reads it."""
 
 
 @contextmanager
@@ -94,7 +91,9 @@ def _is_json(path: Path) -> bool:
         with path.open("rb") as file:
             summary = make_reader(file).get_summary()
     except (McapError, OSError, struct.error, EOFError) as err:
-        raise FormatError(f"{path}: cannot read the MCAP file: {err}", hint=_DAMAGED) from err
+        raise FormatError(
+            f"{path}: cannot read the MCAP file: {err or type(err).__name__}", hint=_DAMAGED
+        ) from err
     kinds = {c.message_encoding for c in summary.channels.values()} if summary else set()
     if kinds - {"json", "cdr", "ros1"}:
         raise FormatError(
