@@ -41,7 +41,7 @@ def expect_shape(raw: NDArray[Any], info: TofInfo, path: object) -> None:
         (K, w, h): "np.swapaxes(raw, -1, -2) puts the rows before the columns",
         (K, h, w): "counts as the sensor gives them, such as uint16",
     }
-    if len(shape) == 3 and shape[1:] == (h, w):
+    if len(shape) == 3 and shape[0] != K and shape[1:] == (h, w):
         hints[shape] = (
             f"other channels than {channels_in_words(info.modulation_hz, info.phase_rad)} are said beside the array: np.savez(path, raw=raw, modulation_hz=hz, phase_rad=phases)"
         )
