@@ -567,6 +567,28 @@ def test_an_unmounted_root_is_not_recorded_into(tmp_path):
     assert len(list((tmp_path / "root").rglob("view-*.h5"))) == 3
 
 
+def test_a_daemon_started_anew_knows_the_disk_that_is_away(tmp_path):
+    """The disk goes while no daemon runs: the next one does not record into the empty folder, however often it is told to."""
+    with running(tmp_path, **_held(tmp_path, 4)) as daemon:
+        daemon.record(3)
+        daemon.wait(lambda s: s["progress"]["sealed"] == 1 and s["doing"])
+        root = daemon.root
+    root.rename(tmp_path / "away")
+    root.mkdir()
+    (tmp_path / "hold").unlink()
+    with running(tmp_path) as daemon:
+        for _ in range(3):
+            assert daemon.wait(lambda s: s["phase"] == "paused")["queue"] == {"queued": 1}
+            daemon.ask("POST", "/v1/resume")
+        assert "unmounted" in daemon.wait(lambda s: s["phase"] == "paused")["reason"]
+        assert not list(root.iterdir())
+        root.rmdir()
+        (tmp_path / "away").rename(root)
+        daemon.ask("POST", "/v1/resume")
+        assert daemon.wait(_over)["job"]["state"] == "done"
+    assert len(list(root.rglob("view-*.h5"))) == 3
+
+
 def test_a_held_or_full_queue_answers_at_once(tmp_path):
     """Another process holds the database, or its disk is full: answers come as JSON, and nothing waits."""
     with running(tmp_path, BENCH_STATE=tmp_path / "full") as daemon:

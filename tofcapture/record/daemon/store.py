@@ -36,6 +36,7 @@ CREATE TABLE IF NOT EXISTS jobs (
 CREATE TABLE IF NOT EXISTS events (
     id INTEGER PRIMARY KEY AUTOINCREMENT, utc TEXT NOT NULL, kind TEXT NOT NULL, data TEXT NOT NULL
 );
+CREATE TABLE IF NOT EXISTS folders (name TEXT PRIMARY KEY, inode TEXT NOT NULL);
 """
 
 
@@ -130,6 +131,19 @@ class Store:
         if wrong := next((job for job in jobs if not _possible(job)), None):
             raise self._db.damaged(f"it says {wrong}")
         return jobs
+
+    def folders(self) -> dict[str, int]:
+        """Find the inodes of the folders that are held, by name: "" is the root, the others are recordings."""
+        rows = self._db.do("SELECT name, inode FROM folders")
+        return {str(name): int(inode) for name, inode in rows if str(inode).isdecimal()}
+
+    def hold_folders(self, folders: Mapping[str, int | None]) -> None:
+        """Remember folders by their inodes, or forget those of ``None``."""
+        for name, inode in folders.items():
+            if inode is None:
+                self._db.do("DELETE FROM folders WHERE name = ?", (name,))
+            else:  # as text: an inode may need all 64 bits
+                self._db.do("INSERT OR REPLACE INTO folders VALUES (?, ?)", (name, str(inode)))
 
     def ended(self) -> list[Job]:
         """List the 100 jobs that ended last, the last one first."""

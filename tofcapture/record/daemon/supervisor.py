@@ -13,6 +13,7 @@ import traceback
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, Self
 
 from tofcapture import __version__
@@ -161,6 +162,12 @@ class Progress:
         return {"job": self.job, "views": [self.views[i] for i in sorted(self.views)]}
 
 
+def _inode_of(folder: Path) -> int | None:
+    """Inode of a folder, ``None`` where there is none; a device's number may change when a machine starts."""
+    known = identity_of(folder)
+    return known and known[1]
+
+
 class Supervisor:
     """Works on the queue until closed; what was running when the last daemon died waits, paused, for a person."""
 
@@ -172,9 +179,14 @@ class Supervisor:
         self._recorder: RecorderProcess | None = None
         self._wake = asyncio.Event()
         self._busy = self._stopping = self._closing = False
-        self._root = identity_of(settings.root)
-        self._begun: set[str] = set()  # recordings, by this daemon
-        self._look_again = False
+        self._held: dict[str, int] = (
+            store.folders()
+        )  # inodes of the root and of the recordings that were begun
+        if "" not in self._held:
+            self._hold({"": _inode_of(settings.root)})
+        self._gone = self._look_again = (
+            False  # the queue rests for a folder that went; a person has looked since
+        )
         self._stored: dict[str, Any] = {"job": None, "queue": {}, "last_event": 0}
         self.reason, self.fault = "", ""  # why it rests; the kind of error, where one is why
         if settings.station is None:
@@ -202,7 +214,7 @@ class Supervisor:
         self._check_clear(request["clear"])
         check_scene_name(request["scene"])
         if not (self.settings.root / request["recording"]).is_dir():
-            self._begun.discard(request["recording"])  # whoever asks anew may begin anew
+            self._hold({request["recording"]: None})  # whoever asks anew may begin anew
         job, new = self.store.add({key: request[key] for key in WISH if key in request})
         if new:
             self._say("queued", job=asdict(job))
@@ -233,7 +245,8 @@ class Supervisor:
     def resume(self, clear: bool) -> None:
         """Go on."""
         self._check_clear(clear)
-        self.reason, self.fault, self._look_again = "", "", True
+        self.reason, self.fault = "", ""
+        self._look_again, self._gone = self._gone, False
         if not self._stopping:
             self._order("resume")
         self._wake.set()
@@ -297,19 +310,29 @@ class Supervisor:
         self._rest()
         self._say("log", text=self.reason)
 
-    def _root_trouble(self, job: Job) -> str:
-        """Say why a job must not be begun: the root, or its recording, is not the folder that it was."""
-        root, again = self.settings.root, self._look_again
-        now, self._look_again = identity_of(root), False
-        lacking = [name for name in sorted(self._begun) if not (root / name).is_dir()]
-        if again and now is not None and not lacking:
-            self._root = now  # a person has looked, and what was begun is there
-        what = "put it back or mount it, then resume; or cancel the job and ask anew"
-        if now != self._root:
-            return f"{root} is not the folder that it was: moved, deleted or unmounted: {what}"
-        if job.recording in lacking:
-            return f"{root / job.recording} is not there any more: {what}"
+    async def _folder_trouble(self, job: Job) -> str:
+        """Say why a job must not be begun: the root, or its recording, is not the folder that it was, also before a restart."""
+        root, again, self._look_again = self.settings.root, self._look_again, False
+        held = {name: self._held[name] for name in ("", job.recording) if name in self._held}
+        now = await asyncio.to_thread(lambda: {name: _inode_of(root / name) for name in held})
+        if again and None not in now.values():
+            self._hold(now)  # a person was told, has looked, and both are there
+        elif changed := [name for name in held if now[name] != held[name]]:
+            self._gone = True
+            what = "is not there any more" if now[changed[0]] is None else "is not the folder that it was"
+            hint = "put it back or mount it, then resume; or cancel the job and ask anew"
+            return f"{root / changed[0]} {what}: moved, deleted or unmounted: {hint}"
         return ""
+
+    def _hold(self, folders: Mapping[str, int | None]) -> None:
+        """Remember folders by their inodes, "" the root, for the next daemon too; None forgets."""
+        self._held = {
+            name: inode for name, inode in (self._held | dict(folders)).items() if inode is not None
+        }
+        with contextlib.suppress(
+            TofError
+        ):  # another process holds the database: this daemon knows all the same
+            self.store.hold_folders(folders)
 
     async def _note(self, number: int, state: str, reason: str = "") -> None:
         """Put a job into another state, however long another process holds the database."""
@@ -362,7 +385,7 @@ class Supervisor:
 
     async def _record(self, job: Job) -> dict[str, Any]:
         """Run one recorder; return its last message, empty when it died."""
-        if trouble := await asyncio.to_thread(self._root_trouble, job):
+        if trouble := await self._folder_trouble(job):
             return {"kind": "error", "own": False, "message": trouble, "cause": "FolderGone"}
         settings = self.settings
         told = {
@@ -396,7 +419,7 @@ class Supervisor:
         kind = message.pop("kind")
         self.counters[kind] += 1
         if kind == "planned":
-            self._begun.add(recording)
+            self._hold({recording: _inode_of(self.settings.root / recording)})
         if kind == "sealed":
             message["preview"] = self.counters["sealed"]
         self._say(kind, job=self.progress.job, progress=self.progress.counts(), **message)
