@@ -117,6 +117,10 @@ def _write(form, folder, raw, depth):
         for i in range(len(raw)):
             arrays = {"raw": np.moveaxis(raw[i], 0, -1), "depth": depth[i]}
             _matlab(folder / f"view{i}.mat", arrays, seven_three=form == "mat73")
+    elif form == "mat-scene":
+        _matlab(
+            folder / "mug.mat", {"raw": np.moveaxis(raw, (0, 1), (3, 2)), "depth": np.moveaxis(depth, 0, -1)}
+        )
     elif form == "hdf5":
         with h5py.File(folder / "mug.h5", "w") as file:
             file["tof/raw"], file["gt/depth"] = raw[:, None], depth
@@ -149,7 +153,7 @@ def _write(form, folder, raw, depth):
 
 
 FORMS = (
-    "npy", "big-endian", "npz", "npz-scene", "mat", "mat73", "hdf5", ".png", ".tif", "millimetres", "folders", "words", "points",
+    "npy", "big-endian", "npz", "npz-scene", "mat", "mat73", "mat-scene", "hdf5", ".png", ".tif", "millimetres", "folders", "words", "points",
 )  # fmt: skip
 
 

@@ -177,13 +177,13 @@ _CAMERA = "fx,fy,cx,cy[,k1,k2,p1,p2,k3], or a file of Kalibr, ROS, OpenCV or COL
 
 def _configure_rig(parser: argparse.ArgumentParser) -> None:
     subs = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
-    out = {
+    out: dict[str, Any] = {
         "type": Path,
         "default": Path("rig.toml"),
         "metavar": "RIG.toml",
         "help": "file to write (default: rig.toml)",
     }
-    size = {"metavar": "H,W", "help": "image size, where the camera does not say it"}
+    size: dict[str, Any] = {"metavar": "H,W", "help": "image size, where the camera does not say it"}
     for name, text in (
         ("init", "write the rig of a ToF camera"),
         ("convert", "write a rig from another tool's camera"),

@@ -275,6 +275,9 @@ def _of_one(
     if len(targets) == 1 and targets[0].path.suffix.lower() in SURFACES:
         targets *= count
     elif len(targets) == 1:
+        shape = targets[0].load().shape
+        if len(shape) == 3 and shape[:2] == array.shape[-2:] and shape[2] == max(array.shape[:2]) > 1:
+            targets = [replace(targets[0], load=partial(_views_first, targets[0].load))]  # MATLAB's order
         n = _leading(targets[0].load(), array.shape[-2:])
         if count == 1 and n == array.shape[1] > 1:  # a truth for every frame: these are views
             array = array[0][:, None]
@@ -298,6 +301,10 @@ def _of_one(
         _planned(pieces, partial(array.__getitem__, i), targets[i] if targets else None, None)
         for i in range(count)
     ]
+
+
+def _views_first(load: Callable[[], Array]) -> Array:
+    return np.moveaxis(load(), -1, 0)
 
 
 def _leading(array: Array, size: tuple[int, ...]) -> int:

@@ -180,9 +180,9 @@ def _cast(triangles: Float64, camera: Camera) -> Float32:
     scene = o3d.t.geometry.RaycastingScene()
     corners = np.ascontiguousarray(triangles.reshape(-1, 3), dtype=np.float32)
     numbers = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-    scene.add_triangles(o3d.core.Tensor(corners), o3d.core.Tensor(numbers))
+    scene.add_triangles(o3d.core.Tensor.from_numpy(corners), o3d.core.Tensor.from_numpy(numbers))
     rays = np.concatenate([np.zeros_like(camera.rays), camera.rays], axis=-1).astype(np.float32)
-    found: Float32 = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
+    found: Float32 = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()
     return np.where(np.isfinite(found), found, np.float32(np.nan))
 
 

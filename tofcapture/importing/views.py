@@ -28,7 +28,7 @@ from tofcapture.importing.truth import point_map
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig, dumps_rig, load_rig
 
-_SAME_PIXEL = 0.1
+_SAME_PIXEL = 0.1  # px; cameras that were fitted to points differ by what is left of noise
 Progress = Callable[[str, int, int], None]
 """Called with a scene, views done, views in all."""
 STANDING: Float64 = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -248,8 +248,8 @@ def _keep_rig(out: Path, rig: Rig, model: str) -> None:
 def _alike(a: Camera, b: Camera) -> bool:
     """Whether cameras are the same but for what is left of fitting one to points."""
     lens = {c.distortion for c in (a, b)}
-    numbers = [[c.width, c.height, c.fx, c.fy, c.cx, c.cy] for c in (a, b)]
-    return len(lens) == 1 and bool(np.allclose(*numbers, rtol=0, atol=_SAME_PIXEL))
+    one, two = ([c.width, c.height, c.fx, c.fy, c.cx, c.cy] for c in (a, b))
+    return len(lens) == 1 and bool(np.allclose(one, two, rtol=0, atol=_SAME_PIXEL))
 
 
 def _publish(out: Path, scene: str) -> None:
