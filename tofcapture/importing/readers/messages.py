@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -63,12 +64,8 @@ def opened(path: Path) -> Iterator[Any]:
             ) -> Iterator[Message]:
                 chosen = [c for c in bag.connections if not topics or c.topic in topics]
                 for link, time, data in bag.messages(chosen, start, stop) if chosen else ():
-                    yield (
-                        link.topic,
-                        link.msgtype.split("/")[-1],
-                        time,
-                        lambda d=data, t=link.msgtype: bag.deserialize(d, t),
-                    )
+                    kind, load = link.msgtype.split("/")[-1], partial(bag.deserialize, data, link.msgtype)
+                    yield link.topic, kind, time, load
 
             yield messages
     except (AnyReaderError, OSError, ValueError, KeyError, AssertionError, struct.error) as err:
@@ -104,18 +101,17 @@ def _is_json(path: Path) -> bool:
 
 
 def _json_messages(path: Path, topics: Any, start: int | None, stop: int | None) -> Iterator[Message]:
-    import json
-
     from mcap.reader import make_reader
 
     with path.open("rb") as file:
         for schema, channel, m in make_reader(file).iter_messages(list(topics) or None, start, stop):
             kind = _FOXGLOVE.get(schema.name.split(".")[-1], "") if schema else ""
-            yield channel.topic, kind, m.log_time, lambda d=m.data, k=kind: _foxglove(json.loads(d), k)
+            yield channel.topic, kind, m.log_time, partial(_foxglove, m.data, kind)
 
 
-def _foxglove(told: Mapping[str, Any], kind: str) -> Any:
+def _foxglove(data: bytes, kind: str) -> Any:
     """Give a message of Foxglove's the names that ROS's has."""
+    told: dict[str, Any] = json.loads(data)
     stamp = SimpleNamespace(sec=told["timestamp"]["sec"], nanosec=told["timestamp"]["nsec"])
     header = SimpleNamespace(stamp=stamp, frame_id=told.get("frame_id", told.get("parent_frame_id", "")))
     if kind == "TFMessage":
@@ -124,8 +120,8 @@ def _foxglove(told: Mapping[str, Any], kind: str) -> Any:
         one = SimpleNamespace(header=header, child_frame_id=told["child_frame_id"], transform=link)
         return SimpleNamespace(transforms=[one])
     rest = {k: v for k, v in told.items() if k not in {"timestamp", "frame_id", "data"}}
-    data = np.frombuffer(base64.b64decode(told["data"]), np.uint8) if "data" in told else None
-    return SimpleNamespace(header=header, data=data, is_bigendian=0, **rest)
+    values = np.frombuffer(base64.b64decode(told["data"]), np.uint8) if "data" in told else None
+    return SimpleNamespace(header=header, data=values, is_bigendian=0, **rest)
 
 
 def stamp_of(message: Any) -> int:
