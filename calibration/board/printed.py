@@ -67,7 +67,7 @@ def _smooth(pixels: Float64, at: Float64) -> Float64:
     flat = cv2.perspectiveTransform(at[:, None], H)[:, 0]
     if len(at) < BENDABLE:
         return np.asarray(flat)
-    x, y = ((at - at.mean(axis=0)) / np.ptp(at, axis=0).max()).T
+    x, y = ((flat - flat.mean(axis=0)) / np.ptp(flat, axis=0).max()).T
     columns = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=-1)
     off, weight = pixels - flat, np.ones((len(at), 1))
     for _ in range(10):
@@ -94,7 +94,7 @@ def _fitted(
     dy, dx = np.meshgrid(fine, fine, indexing="ij")
     about = np.stack([u[..., None] + dx.reshape(-1), v[..., None] + dy.reshape(-1)], axis=-1)
     out, settled = pixels.copy(), np.zeros(len(pixels), dtype=bool)
-    for _ in range(4):
+    for _ in range(6):
         for k, (pixel, place) in enumerate(zip(out, at, strict=True)):
             row, column = np.rint(pixel[::-1]).astype(int)
             part = image[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
