@@ -131,6 +131,11 @@ def _write(form, folder, raw, depth):
             np.save(folder / f"raw_{i}.npy", raw[i])
             np.save(folder / f"depth_{i}.npy", np.float64(1000) * depth[i])
         return {"truth": {"unit": "mm"}}
+    elif form == "turned":
+        np.save(folder / "raw.npy", np.swapaxes(raw[:, None], 3, 4))
+        for i in range(len(raw)):
+            np.save(folder / f"depth_{i}.npy", depth[i].T)
+        return {"raw": {"axes": "NFKWH"}, "truth": {"axes": "WH"}}
     elif form == "folders":
         for i in range(len(raw)):
             (folder / "tof" / f"{i:03d}").mkdir(parents=True)
@@ -153,7 +158,7 @@ def _write(form, folder, raw, depth):
 
 
 FORMS = (
-    "npy", "big-endian", "npz", "npz-scene", "mat", "mat73", "mat-scene", "hdf5", ".png", ".tif", "millimetres", "folders", "words", "points",
+    "npy", "big-endian", "npz", "npz-scene", "mat", "mat73", "mat-scene", "hdf5", ".png", ".tif", "millimetres", "turned", "folders", "words", "points",
 )  # fmt: skip
 
 
@@ -233,6 +238,7 @@ def wrong(folder):
         "depth mirrored": (lambda: put(d=depth[:, :, ::-1]), "agrees with the ToF image", "fliplr"),
         "depth upside down": (lambda: put(d=depth[:, ::-1]), "agrees with the ToF image", "flipud"),
         "depth turned by half": (lambda: put(d=depth[:, ::-1, ::-1]), "agrees with the ToF image", "rot90"),
+        "depth turned": (lambda: put(d=np.swapaxes(depth, 1, 2)), "turned", '[truth] axes = "WH"'),
         "depth of another size": (lambda: put(d=depth[:, ::2, ::2]), "depth in the ToF image", "truth.camera"),
         "depth behind the camera": (lambda: put(d=-depth), "behind it", "OpenGL"),
         "depth all zero": (lambda: put(d=0 * depth), "every pixel is missing", "leave"),

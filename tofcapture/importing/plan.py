@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.errors import ConfigError, DataError
+from tofcapture.errors import DataError
 from tofcapture.files.view import check_scene_name
 from tofcapture.importing.poses import poses_of, read_poses
 from tofcapture.importing.readers.vendors import decode, facts_of_layout
@@ -415,9 +415,3 @@ def _some(names: Any) -> str:
     names = list(names)
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     return ", ".join(names[:MOST_NAMED]) + more
-
-
-def require(found: Mapping[str, object], where: str, hint: str) -> None:
-    """Name everything that is missing, at once: the keys whose value is ``None`` or empty."""
-    if missing := [key for key, value in found.items() if value is None or value == ()]:
-        raise ConfigError(f"{where}: missing {', '.join(missing)}", hint=hint)

@@ -38,7 +38,7 @@ _TRUTH = (
     "T_world_truth",
     "time_offset_s",
 )
-_POSES = ("file", "unit", "maps", "time_offset_s", "shift_s")
+_POSES = ("file", "unit", "maps", "time_offset_s")
 _KEYS = {"tof": _TOF, "raw": _RAW, "truth": _TRUTH, "poses": _POSES}
 
 
@@ -72,7 +72,7 @@ class Said:
     scene: str = ""  #: Name of the scene.
     tof: Mapping[str, Any] = None  # type: ignore[assignment]  #: Intrinsics, channels, saturation, light source.
     raw: Mapping[str, Any] = None  # type: ignore[assignment]  #: Which arrays, axes, layout of bytes.
-    truth: Mapping[str, Any] = None  # type: ignore[assignment]  #: Which arrays, kind, unit, frame.
+    truth: Mapping[str, Any] = None  # type: ignore[assignment]  #: Which arrays, kind, unit, axes, camera.
     poses: Mapping[str, Any] = None  # type: ignore[assignment]  #: Which file, unit, direction, clock.
 
     def __post_init__(self) -> None:

@@ -44,6 +44,8 @@ def point_map(view: Planned, said: Said, tof: Camera) -> PointMap:
     values, kind = view.truth(), str(said.truth.get("kind", ""))
     if values.shape[1:] in {(3,), (3, 3)} and len(values) > 3:
         return _of_surface(values, view, said, pinhole, where)
+    if said.truth.get("axes") == "WH":
+        values = np.swapaxes(values, 0, 1)
     if values.ndim == 3 and 1 in (values.shape[0], values.shape[-1]):
         values = values.reshape([n for n in values.shape if n > 1])
     if values.ndim == 3 and values.shape[0] == 3 and values.shape[-1] != 3:
@@ -71,7 +73,7 @@ def _of_depth(
         turned = " turned" if depth.shape == tof.shape[::-1] else ""
         raise DataError(
             f"{where}: expected depth in the ToF image, {tof.shape}, got {depth.shape}{turned}",
-            hint="[truth] axes says that rows and columns have changed places"
+            hint='rows and columns have changed places: [truth] axes = "WH" in import.toml'
             if turned
             else "of another camera? [truth.camera] width, height, fx, fy, cx, cy and [truth] T_tof_truth in import.toml",
         )
