@@ -3,7 +3,7 @@
 Standard Denavit-Hartenberg: ``T_{i-1,i} = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i)``; UR arms have alpha = 90, 0, 0, 90, -90, 0 deg. Their
 constants are the manufacturer's nominal ones (support article "DH parameters for calculations of kinematics and
 dynamics"); a real arm's calibrated ones differ by 1-2 mm, which is why a real driver reports measured poses. Where the metal
-stands beside the frames is in the manufacturer's ``ur_description`` (config/*/physical_parameters.yaml, ``offsets``).
+stands beside the frames is in the manufacturer's ``ur_description`` (``offsets`` in the physical parameters of each model).
 
 The closed form follows Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013), with sines and
 cosines taken from the same matrix entries, so that it stays exact next to the wrist singularity.
