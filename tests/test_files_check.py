@@ -193,7 +193,7 @@ def test_the_command(here):
     code, result = run(here / "dataset")
     assert (code, result["ok"]) == (5, False)
     assert all({"path", "where", "message", "hint"} == set(p) for p in result["problems"])
-    assert run(here / "nowhere")[0] == 3
+    assert run(here / "nowhere")[0] == 5
 
 
 def test_simulated_views_of_other_poses_are_fine(tmp_path):

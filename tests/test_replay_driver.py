@@ -31,7 +31,7 @@ VIEWS, FRAMES = 3, 2
 class Bench:
     """All devices in one, with measured joints a little off the goal and noise that is never the same again."""
 
-    simulated = True
+    simulated, by_hand, fixed = True, False, False
 
     def __init__(self):
         self.rng, self.joints, self.now = np.random.default_rng(), HOME.copy(), 0
