@@ -124,7 +124,7 @@ def test_each_check_fires_on_what_it_is_for(name, change):
     assert failing <= {name, *(("overlap",) if name == "stereo_coverage" else ())}
 
 
-def _slanted(hz=(20e6, 100e6), near=0.5, far=1.5, **stated):
+def _slanted(hz=(20e6, 100e6), near=0.5, far=1.5, delay=2.0, **stated):
     """A wall from near to far as channels of ``hz`` see it, described by a driver that may state something else."""
     parts = _good()
     u = np.linspace(0, 1, 64)
@@ -144,9 +144,7 @@ def _slanted(hz=(20e6, 100e6), near=0.5, far=1.5, **stated):
     good = ((at >= 0) & (at < [48, 36])).all(axis=1)
     range_[at[good, 1], at[good, 0]] = np.linalg.norm(seen[good], axis=1)
     range_ = np.where(np.isnan(range_), np.nanmean(range_), range_)
-    phase = (
-        4 * np.pi / SPEED_OF_LIGHT * np.array(true.modulation_hz)[:, None, None] * range_ + 2.0
-    )  # a delay of its own
+    phase = 4 * np.pi / SPEED_OF_LIGHT * np.array(true.modulation_hz)[:, None, None] * range_ + delay
     clean = 600 + 200 * np.cos(phase + np.array(true.phase_rad)[:, None, None])
     raw = np.round(clean + np.random.default_rng(0).normal(0, 4, (FRAMES, *clean.shape))).astype(np.uint16)
     info = replace(
@@ -170,6 +168,16 @@ def test_channels_that_are_not_what_the_driver_states_are_refused(hz):
     assert "misread" in _failing(_slanted(hz, modulation_hz=swapped))
     assert "misread" in _failing(_slanted(hz, phase_rad=[0, 3, 2, 1, 4, 7, 6, 5]))
     assert "misfit" in _failing(_slanted(hz, phase_rad=[1, 0, 2, 3, 4, 5, 6, 7]))
+
+
+@pytest.mark.parametrize("hz", [(20e6, 100e6), (60.24e6, 80.32e6), (40e6, 70e6), (54e6, 189e6, 198e6)])
+@pytest.mark.parametrize("depth", [0.62, 0.8, 1.13])
+def test_exchanged_frequencies_are_refused_before_a_wall_too(hz, depth):
+    """Of a flat scene phases say little; that the depths are the stereo camera's with the frequencies exchanged says all."""
+    wall = (depth, depth + 0.01)
+    assert _failing(_slanted(hz, *wall, delay=0.0)) == set()
+    turned = [k for f in reversed(range(len(hz))) for k in range(4 * f, 4 * f + 4)]
+    assert _failing(_slanted(hz, *wall, delay=0.0, modulation_hz=turned)) & {"exchanged", "misread"}
 
 
 def test_an_offset_between_the_frequencies_is_measured():

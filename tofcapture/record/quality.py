@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,10 @@ _CELLS = (18, 24)  # of the ToF image, in which overlap is counted
 _COLUMNS = 320  # of the stereo grid are enough for that
 _BLOCK = 20  # px; side of the blocks whose means are compared between frames
 _CLOCKS = 50_000_000  # ns; how far a device's idea of the host's clock may be off
+_FAR, _NEAR = (
+    0.1,
+    0.03,
+)  # m; median distance from the stereo camera's depths that no rig off by a drawing explains, and one of sound depths
 _BRIGHT = 50.0  # raw units; noise plays no part in how taps fit each other, and the other camera
 _FEW = 500  # bright pixels, or points that both cameras see, below which nothing is said of that
 # rad; better than that multipath and edges let no phase agree with the stereo camera's distances
@@ -89,6 +94,7 @@ LIMITS = (
     Limit("stereo_coverage", 0.02, REFUSE, "the stereo camera measured {0:.1%} of its image", _PROJECTOR, least=True),
     Limit("misfit", 0.25, REFUSE, "the taps fit no cosine of the phases that the driver states: {0:.0%} of the amplitude is left over", _ORDER),
     Limit("misread", 2.0, REFUSE, "the phases fit the stereo camera's depths {0:.1f} times better with other frequencies or signs", _ORDER),
+    Limit("exchanged", 3.0, REFUSE, "with its frequencies exchanged the ToF camera is {0:.0f} times nearer to the stereo camera's depths", _ORDER),
     Limit("out_of_reach", 0.5, REFUSE, "{0:.0%} of the scene lies where the ToF frequencies cannot tell its distance", _REACH),
     Limit("frame_drops", 0, RETAKE, "{0:.0f} frames were dropped within the burst", _LINK),
     Limit("flicker", 0.03, RETAKE, "the light changed by {0:.1%} between the frames", "keep people and lamps out of sight; shade the sun"),
@@ -126,7 +132,7 @@ def measure(
         "stereo_coverage": float(np.isfinite(stereo.points[..., 2]).mean()),
         "overlap": _overlap(stereo, rig),
         "misfit": _misfit(tof, phasor),
-        **_offset(tof, rig),
+        **_decoded(tof, stereo, rig),
         **_against_stereo(phasor, info, stereo, rig),
     }
     if len(tof.raw) >= 3:
@@ -206,14 +212,39 @@ def _misfit(tof: TofBurst, phasor: Complex128) -> float:
     return max(left)
 
 
-def _offset(tof: TofBurst, rig: Rig) -> dict[str, float]:
-    """Find what ranges of the frequencies differ by, beyond what rig or camera know: metres, and a share of the closest wraps' distance."""
+def _decoded(tof: TofBurst, stereo: StereoFrame, rig: Rig) -> dict[str, float]:
+    """Find what ranges of the frequencies differ by, beyond what rig or camera know: metres, and a share of the closest wraps' distance.
+
+    ``exchanged`` is how much nearer depths come to the stereo camera's when frequencies are exchanged; 0 where those stated are near.
+    """
     info = replace(tof.info, range_errors=rig.range_errors or tof.info.range_errors)
-    decoder = Decoder(info, min_amplitude=_BRIGHT)
+    decoder, hz = Decoder(info, min_amplitude=_BRIGHT), frequencies(info.modulation_hz)
     raw, celsius = tof.raw.mean(axis=0, dtype=np.float64), float(np.mean(tof.celsius))
-    offsets = decoder.signals(raw, celsius)[1].offsets
-    share = float(mismatch(offsets, frequencies(info.modulation_hz))) / decoder.wraps.apart
-    return {"offset": share, "offset_m": float(np.abs(offsets).max())}
+    maps, signals = decoder.signals(raw, celsius)
+    share = float(mismatch(signals.offsets, hz)) / decoder.wraps.apart
+    found = {"offset": share, "offset_m": float(np.abs(signals.offsets).max()), "exchanged": 0.0}
+    away = _from_stereo(maps.depth, stereo, rig)
+    if away > _FAR:
+        others = [_exchange(info, dict(zip(hz, other, strict=True))) for other in permutations(hz)][1:]
+        depths = (Decoder(each, min_amplitude=_BRIGHT)(raw, celsius).depth for each in others)
+        least = min((_from_stereo(depth, stereo, rig) for depth in depths), default=np.inf)
+        found["exchanged"] = away / max(least, _NEAR / 10) if least < _NEAR else 0.0
+    return found
+
+
+def _exchange(info: TofInfo, other: dict[float, float]) -> TofInfo:
+    return replace(info, modulation_hz=tuple(other[f] for f in info.modulation_hz), range_errors=())
+
+
+def _from_stereo(depth: NDArray[np.float32], stereo: StereoFrame, rig: Rig) -> float:
+    """Median distance of depths from the stereo camera's, metres; 0 where too few are told."""
+    points, pixels = _in_tof_image(stereo, rig)
+    if depth.shape != rig.tof.shape:
+        return 0.0
+    u, v = np.rint(pixels).astype(np.intp).T
+    apart = np.abs(depth[v, u] - points[:, 2])
+    told = np.isfinite(apart)
+    return float(np.median(apart[told])) if told.sum() >= _FEW else 0.0
 
 
 def _against_stereo(phasor: Complex128, info: TofInfo, stereo: StereoFrame, rig: Rig) -> dict[str, float]:
