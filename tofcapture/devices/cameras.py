@@ -11,9 +11,9 @@ from typing import Any, Self
 
 from tofcapture.devices import Device
 from tofcapture.errors import ConfigError, DeviceError, FormatError
-from tofcapture.files.hdf import tof_from
+from tofcapture.files.hdf import stereo_from, tof_from
 from tofcapture.files.seal import write_text
-from tofcapture.frames import TofInfo
+from tofcapture.frames import StereoInfo, TofInfo
 
 
 class ReopenedCamera(Device):
@@ -107,7 +107,19 @@ def described(
 
 def tof_info(table: Mapping[str, Any], where: str, page: str) -> TofInfo:
     """Turn a whole table into a ToF camera's description; raises ConfigError, with a ``page`` of the docs as the hint."""
-    try:
+    with _named(page):
         return tof_from(table, where)
+
+
+def stereo_info(table: Mapping[str, Any], where: str, page: str) -> StereoInfo:
+    """Turn a whole table into a stereo camera's description, as :func:`tof_info` does."""
+    with _named(page):
+        return stereo_from(table, where)
+
+
+@contextmanager
+def _named(page: str) -> Iterator[None]:
+    try:
+        yield
     except FormatError as err:
         raise ConfigError(err.message, hint=f"see {page}") from err

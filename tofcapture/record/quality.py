@@ -120,6 +120,7 @@ def measure(
     shift, turn = moved(before.T_base_flange, after.T_base_flange)
     dark = float((amplitude < DARK).mean())
     times = np.asarray(tof.time_ns, dtype=np.int64)
+    points, pixels = _in_tof_image(stereo, rig)
     found = {
         "motion_m": shift,
         "motion_deg": float(np.degrees(turn)),
@@ -130,10 +131,10 @@ def measure(
         "dark": dark,
         "unlit": dark,
         "stereo_coverage": float(np.isfinite(stereo.points[..., 2]).mean()),
-        "overlap": _overlap(stereo, rig),
+        "overlap": _overlap(pixels, rig.tof),
         "misfit": _misfit(tof, phasor),
-        **_decoded(tof, stereo, rig),
-        **_against_stereo(phasor, info, stereo, rig),
+        **_decoded(tof, points, pixels, rig),
+        **_against_stereo(phasor, info, points, pixels, rig.tof),
     }
     if len(tof.raw) >= 3:
         found["flicker"] = _flicker(tof.raw)
@@ -188,10 +189,9 @@ def _in_tof_image(stereo: StereoFrame, rig: Rig) -> tuple[Float64, Float64]:
     return points[within], pixels[within]
 
 
-def _overlap(stereo: StereoFrame, rig: Rig) -> float:
+def _overlap(pixels: Float64, camera: Camera) -> float:
     """Share of the ToF image's cells into which a stereo point falls."""
-    camera = rig.tof
-    u, v = _in_tof_image(stereo, rig)[1].T
+    u, v = pixels.T
     cells = (min(_CELLS[0], camera.height), min(_CELLS[1], camera.width))
     edges = ((-0.5, camera.height - 0.5), (-0.5, camera.width - 0.5))
     hit = np.histogram2d(v, u, bins=cells, range=edges)[0]
@@ -212,7 +212,7 @@ def _misfit(tof: TofBurst, phasor: Complex128) -> float:
     return max(left)
 
 
-def _decoded(tof: TofBurst, stereo: StereoFrame, rig: Rig) -> dict[str, float]:
+def _decoded(tof: TofBurst, points: Float64, pixels: Float64, rig: Rig) -> dict[str, float]:
     """Find what ranges of the frequencies differ by, beyond what rig or camera know: metres, and a share of the closest wraps' distance.
 
     ``exchanged`` is how much nearer depths come to the stereo camera's when frequencies are exchanged; 0 where those stated are near.
@@ -223,37 +223,35 @@ def _decoded(tof: TofBurst, stereo: StereoFrame, rig: Rig) -> dict[str, float]:
     maps, signals = decoder.signals(raw, celsius)
     share = float(mismatch(signals.offsets, hz)) / decoder.wraps.apart
     found = {"offset": share, "offset_m": float(np.abs(signals.offsets).max()), "exchanged": 0.0}
-    away = _from_stereo(maps.depth, stereo, rig)
-    if away > _FAR:
+    if maps.depth.shape == rig.tof.shape and (away := _from_stereo(maps.depth, points, pixels)) > _FAR:
         others = [_exchange(info, dict(zip(hz, other, strict=True))) for other in permutations(hz)][1:]
         depths = (Decoder(each, min_amplitude=_BRIGHT)(raw, celsius).depth for each in others)
-        least = min((_from_stereo(depth, stereo, rig) for depth in depths), default=np.inf)
+        least = min((_from_stereo(depth, points, pixels) for depth in depths), default=np.inf)
         found["exchanged"] = away / max(least, _NEAR / 10) if least < _NEAR else 0.0
     return found
 
 
 def _exchange(info: TofInfo, other: dict[float, float]) -> TofInfo:
+    """Describe a camera whose channels have other frequencies; range errors belong to those that were stated."""
     return replace(info, modulation_hz=tuple(other[f] for f in info.modulation_hz), range_errors=())
 
 
-def _from_stereo(depth: NDArray[np.float32], stereo: StereoFrame, rig: Rig) -> float:
+def _from_stereo(depth: NDArray[np.float32], points: Float64, pixels: Float64) -> float:
     """Median distance of depths from the stereo camera's, metres; 0 where too few are told."""
-    points, pixels = _in_tof_image(stereo, rig)
-    if depth.shape != rig.tof.shape:
-        return 0.0
     u, v = np.rint(pixels).astype(np.intp).T
     apart = np.abs(depth[v, u] - points[:, 2])
     told = np.isfinite(apart)
     return float(np.median(apart[told])) if told.sum() >= _FEW else 0.0
 
 
-def _against_stereo(phasor: Complex128, info: TofInfo, stereo: StereoFrame, rig: Rig) -> dict[str, float]:
+def _against_stereo(
+    phasor: Complex128, info: TofInfo, points: Float64, pixels: Float64, camera: Camera
+) -> dict[str, float]:
     """Hold phases against the stereo camera's distances, whatever constant lies between them, and distances against the reach.
 
     ``misread`` is by how much another frequency of the camera, or the other sign, makes the phases agree better; 0 where they agree.
     """
-    points, pixels = _in_tof_image(stereo, rig)
-    if len(points) < _FEW or phasor.shape[1:] != rig.tof.shape:
+    if len(points) < _FEW or phasor.shape[1:] != camera.shape:
         return {"misread": 0.0, "out_of_reach": 0.0}
     u, v = np.rint(pixels).astype(np.intp).T
     range_ = (np.linalg.norm(points, axis=1) + np.linalg.norm(points - info.illuminator, axis=1)) / 2

@@ -19,11 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.devices import StereoDevice
-from tofcapture.devices.cameras import ReopenedCamera, described, read_description, write_description
+from tofcapture.devices.cameras import (
+    ReopenedCamera,
+    described,
+    read_description,
+    stereo_info,
+    write_description,
+)
 from tofcapture.devices.host import hosted
 from tofcapture.devices.registry import check_keys
-from tofcapture.errors import ConfigError, DeviceError, FormatError
-from tofcapture.files.hdf import stereo_from
+from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.frames import StereoFrame, StereoInfo
 
 if TYPE_CHECKING:
@@ -74,10 +79,7 @@ class Ensenso(ReopenedCamera, StereoDevice):
         """
         where = f"[stereo] {self._serial}"
         said = described(read_description(self._file), self._table, _DESCRIPTION, where)
-        try:
-            return stereo_from({**said, "serial": self._serial}, where)
-        except FormatError as err:
-            raise ConfigError(err.message, hint="see docs/ensenso.md") from err
+        return stereo_info({**said, "serial": self._serial}, where, "docs/ensenso.md")
 
     def capture(self) -> StereoFrame:
         """Take one point map.
