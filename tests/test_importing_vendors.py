@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tofcapture.devices.sim.config import read_constants
 from tofcapture.errors import ConfigError, FormatError
 from tofcapture.files.view import find_views, open_view
-from tofcapture.importing.readers.vendors import decode
+from tofcapture.importing.readers.vendors import LAYOUTS, decode
 from tofcapture.importing.said import Said
 from tofcapture.importing.views import import_data
 
@@ -116,7 +117,7 @@ def ti_opt8241():
 
 def espros():
     """Four images of words; a saturated pixel is a flag."""
-    raw = frames([12], [0, 90, 180, 270], (60, 160), middle=2000)
+    raw = frames([12], [0, 270, 180, 90], (60, 160), middle=2000)
     raw[:, 3, 3] = 64003
     return raw, raw.astype("<u2").tobytes()
 
@@ -131,6 +132,13 @@ ENCODERS = {
     "ti-opt8241": ti_opt8241,
     "espros": espros,
 }
+
+
+@pytest.mark.parametrize("preset", ["epc611", "epc635", "epc660"])
+def test_a_simulated_camera_has_the_phases_of_its_layout(preset):
+    """What the simulator says of an ESPROS chip is what the reader takes its client's images for."""
+    said = read_constants({"tof": {"preset": preset}}, preset).sensor.phase_rad
+    assert np.degrees(said) == pytest.approx(LAYOUTS["espros"].deg)
 
 
 KNOWN_BY_SIZE = ("arducam-b0410", "femto-bolt")
