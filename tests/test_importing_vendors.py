@@ -93,20 +93,26 @@ def luxonis():
     return raw, out
 
 
-def femto_bolt(padded=True):
-    """A header of 160 bytes before each image, every byte followed by a zero on hosts that pad."""
-    mhz = [197.0, 192.0, 54.0]
-    raw = frames(mhz, [0, 120, 240], (576, 640), amplitude=2000)
+def femto_picture(raw, mhz, padded=True, each=True):
+    """Nine images after a header of 160 bytes each, or after one, every byte of it followed by a zero on hosts that pad."""
     out = b""
     for k, image in enumerate(raw):
         head = np.zeros(80, "<u2")
-        head[0], head[6], head[7] = 0x5931, 640, 576
+        head[0], head[6], head[7] = 0x5931, *image.shape[::-1]
         head[49], head[50], head[53] = k | 8 << 6 | 3 << 12, k % 3 | 3 << 4 | k // 3 << 8, mhz[k // 3] * 100
+        head[64] = 41500
         words = np.frombuffer(head.tobytes(), np.uint8)
-        out += (np.column_stack([words, 0 * words]).tobytes() if padded else head.tobytes()) + image.astype(
-            "<i2"
-        ).tobytes()
-    return raw, out + b"\0" * (6666240 - len(out))
+        if each or k == 0:
+            out += np.column_stack([words, 0 * words]).tobytes() if padded else head.tobytes()
+        out += image.astype("<i2").tobytes()
+    return out
+
+
+def femto_bolt():
+    """A picture of the narrow view."""
+    mhz = [197.0, 192.0, 54.0]
+    raw = frames(mhz, [0, 120, 240], (576, 640), amplitude=2000)
+    return raw, femto_picture(raw, mhz).ljust(6666240, b"\0")
 
 
 def ti_opt8241():

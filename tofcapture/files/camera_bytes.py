@@ -68,3 +68,64 @@ ARDUCAM = {
         4810, 640, 480, (*_FOUR, *(2405 + r for r in _FOUR)), 1, (90e6,) * 4 + (15e6,) * 4, QUARTERS * 2
     ),
 }
+
+_CHIP = 0x5931  # the first word of a header whose bytes are not padded
+_HEADER = 160  # bytes
+FEMTO_IMAGES = 9
+
+
+@dataclass(frozen=True)
+class FemtoHeader:
+    """Say what the header before an image of an Orbbec Femto Bolt or Azure Kinect names.
+
+    From github.com/orbbec/OrbbecSDK_v2, YeatsFrameHdr.h (MIT); its bytes alternate with padding on some hosts.
+    """
+
+    shape: tuple[int, int]  #: (H, W) of an image.
+    captures: int  #: Images in the frame.
+    modulation_hz: float
+    phase_rad: float
+    celsius: float  #: Of the laser; NaN when it is not written.
+
+
+@dataclass(frozen=True)
+class Femto:
+    """Say in which pictures such a camera sends its nine images, and how large an image is."""
+
+    width: int  #: Of the picture, 16 bits a pixel.
+    rows: int
+    shape: tuple[int, int]  #: (H, W) of an image.
+
+    @property
+    def size(self) -> int:
+        """Bytes of a picture."""
+        return 2 * self.width * self.rows
+
+
+FEMTO = {"narrow": Femto(7680, 434, (576, 640)), "wide": Femto(8192, 290, (512, 512))}
+
+
+def femto_frame(data: bytes, shape: tuple[int, int]) -> tuple[NDArray[np.int16], list[FemtoHeader]]:
+    """Take a picture apart into nine images (9, H, W) and their headers, or the one header before all."""
+    step = _HEADER * (1 if int.from_bytes(data[:2], "little") == _CHIP else 2)
+    image = 2 * shape[0] * shape[1]
+    each = [k * (step + image) for k in range(FEMTO_IMAGES)]
+    if any(data[at:][:2] != data[:2] for at in each) or data[:2] == b"\0\0":
+        starts, heads = [step + k * image for k in range(FEMTO_IMAGES)], [0]
+    else:
+        starts, heads = [at + step for at in each], each
+    images = np.stack([np.frombuffer(data, "<i2", image // 2, at).reshape(shape) for at in starts])
+    return images, [_femto_header(data[at : at + step]) for at in heads]
+
+
+def _femto_header(data: bytes) -> FemtoHeader:
+    words = np.frombuffer(data[:: len(data) // _HEADER], "<u2").astype(int)
+    step, steps = words[50] & 15, max(words[50] >> 4 & 15, 3)
+    millis = words[64] | words[65] << 16
+    return FemtoHeader(
+        shape=(int(words[7]), int(words[6])),
+        captures=int(words[49] >> 6 & 63) + 1,
+        modulation_hz=1e4 * float(words[53]),
+        phase_rad=2 * np.pi * float(step) / float(steps),
+        celsius=millis / 1e3 if millis else float("nan"),
+    )

@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.errors import ConfigError, FormatError
-from tofcapture.files.camera_bytes import unpack_y12p, with_sign
+from tofcapture.files.camera_bytes import FEMTO_IMAGES, femto_frame, unpack_y12p, with_sign
 from tofcapture.importing.said import Facts, Said
 
 Images = NDArray[Any]  # (n, H, W)
 _QUARTERS, _THIRDS = (0, 90, 180, 270), (0, 120, 240)
-_YEATS = 0x5931  # of a header of this chip without padding
-_HEADER = 160  # bytes
 
 
 @dataclass(frozen=True)
@@ -135,27 +133,17 @@ def _four_of(rows: NDArray[Any], H: int) -> Images:
 
 
 def _femto(data: bytes, size: tuple[int, int]) -> Images:
-    """Nine images after one header, or each after its own; its bytes alternate with padding on some hosts."""
-    step = _HEADER if int.from_bytes(data[:2], "little") == _YEATS else 2 * _HEADER
-    image = 2 * size[0] * size[1]
-    each = all(data[k * (step + image) :][:2] == data[:2] and data[:2] != b"\0\0" for k in range(9))
-    starts = [(k + 1) * step + k * image for k in range(9)] if each else [step + k * image for k in range(9)]
-    return np.stack([np.frombuffer(data, "<i2", image // 2, s).reshape(size) for s in starts])
+    return femto_frame(data, size)[0]
 
 
 def femto_channels(data: bytes, size: tuple[int, int]) -> Facts | None:
     """Read frequency and phase of nine images from the headers before them; ``None`` when there is one header for all."""
-    step = _HEADER if int.from_bytes(data[:2], "little") == _YEATS else 2 * _HEADER
-    pitch = step + 2 * size[0] * size[1]
-    hz, phases = list[float](), list[float]()
-    for k in range(9):
-        head = np.frombuffer(data[k * pitch :][:step][:: step // _HEADER], "<u2")
-        if head[0] != np.frombuffer(data[:step][:: step // _HEADER], "<u2")[0] or not head[53]:
-            return None
-        steps = head[50] >> 4 & 15
-        hz.append(1e4 * float(head[53]))
-        phases.append(2 * np.pi * float(head[50] & 15) / max(int(steps), 3))
-    return Facts(modulation_hz=tuple(hz), phase_rad=tuple(phases))
+    heads = femto_frame(data, size)[1]
+    if len(heads) != FEMTO_IMAGES or not all(h.modulation_hz for h in heads):
+        return None
+    return Facts(
+        modulation_hz=tuple(h.modulation_hz for h in heads), phase_rad=tuple(h.phase_rad for h in heads)
+    )
 
 
 def _azure(data: bytes, size: tuple[int, int]) -> Images:
