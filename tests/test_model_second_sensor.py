@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,29 +31,7 @@ from tofcapture_model.training.train import train
 
 HZ = (15e6,) * 3 + (75e6,) * 3
 PHASES = tuple(2 * np.pi * k / 3 for k in range(3)) * 2
-SECOND = """
-[sim.tof]
-width = 160
-height = 120
-fx = 132.0
-fy = 132.0
-cx = 79.3
-cy = 60.2
-illuminator = [-0.012, 0.0, 0.0]
-[sim.sensor]
-modulation_hz = [15e6, 15e6, 15e6, 75e6, 75e6, 75e6]
-phase_rad = [0.0, 2.0943951023931953, 4.1887902047863905, 0.0, 2.0943951023931953, 4.1887902047863905]
-signal = 350.0
-contrast = [0.8, 0.5]
-[[sim.sensor.range_error]]
-modulation_hz = 15e6
-offset = 0.021
-harmonics = [[3, 0.012, -0.008]]
-[[sim.sensor.range_error]]
-modulation_hz = 75e6
-offset = 0.31
-harmonics = [[3, -0.005, 0.002], [6, 0.001, 0.0]]
-"""
+SECOND = (Path(__file__).parents[1] / "examples" / "second_sensor.toml").read_text()
 
 
 def wall(distance=0.9):

@@ -36,11 +36,11 @@ class TofFlag(IntFlag):
 
 
 TOF_FLAG_DOCS = {
-    TofFlag.SATURATED: "a tap of a frame reached saturation, of either sign, or holds a flag beyond it; there is no depth",
-    TofFlag.FLYING: "on both sides of it, in a row or a column, depth jumps by more than a surface at 80 degrees: a mixed pixel",
-    TofFlag.LOW_CONFIDENCE: "shot and read noise make the depth uncertain by more than 20 mm (one standard deviation)",
-    TofFlag.AMBIGUOUS: "other wraps fit almost as well, or the frequencies disagree as much as a surface out of reach makes them",
-    TofFlag.INCONSISTENT: "taps of a frequency fit no cosine by more than noise: a stuck or swapped tap, motion; with three phases whole lines of a stuck tap",
+    TofFlag.SATURATED: "a tap reached saturation, of either sign; there is no depth",
+    TofFlag.FLYING: "a mixed pixel: on both sides depth jumps beyond 80 degrees",
+    TofFlag.LOW_CONFIDENCE: "noise makes the depth uncertain by more than 20 mm (one sigma)",
+    TofFlag.AMBIGUOUS: "other wraps fit almost as well, or the frequencies disagree",
+    TofFlag.INCONSISTENT: "taps fit no cosine: a stuck or swapped tap, motion",
 }
 
 

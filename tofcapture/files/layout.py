@@ -28,10 +28,10 @@ class MaskBit(IntFlag):
 
 
 MASK_DOCS = {
-    MaskBit.NOT_HIT: "the ray hits no measured surface; depth and normal are NaN, elsewhere they are finite",
-    MaskBit.OCCLUDED: "the ray crosses space that the stereo camera could not see before it hits",
-    MaskBit.GRAZING: "the surface is seen at more than 75 degrees from its normal by either camera",
-    MaskBit.EDGE: "within one pixel of the 1x grid of a depth edge or of a pixel that is not hit",
+    MaskBit.NOT_HIT: "the ray hits no measured surface; depth and normal are NaN",
+    MaskBit.OCCLUDED: "the ray first crosses space that the stereo camera cannot see",
+    MaskBit.GRAZING: "either camera sees the surface at more than 75 degrees",
+    MaskBit.EDGE: "within one 1x pixel of a depth edge or a hole",
     MaskBit.OUTSIDE: "outside the crop around the scene's object: table and background",
 }
 
@@ -102,12 +102,12 @@ def _size(dim: str, sizes: Mapping[str, int]) -> int:
     return int(digits or 1) * sizes[dim[len(digits) :]]
 
 
-def _rows(table: str) -> Iterator[list[str]]:
+def _rows(table: str) -> Iterator[tuple[str, ...]]:
     for line in table.strip().splitlines():
-        yield [cell.strip() for cell in line.split("|")]
+        yield tuple(cell.strip() for cell in line.split("|"))
 
 
-def _field(row: list[str]) -> Field:
+def _field(row: tuple[str, ...]) -> Field:
     """Read a row of a table: path, dtypes, dims, chunk (``1`` and ``*`` for whole, ``-`` for none), units, meaning."""
     path, dtypes, dims, chunk, units, doc = row
     chunks = None if chunk == "-" else tuple(c == "*" for c in chunk.split())
@@ -124,7 +124,7 @@ def _layout(name: str, version: int, title: str, fields: str, attrs: str) -> Lay
 _DESCRIPTIONS = """\
 units       | text | always "m"; seconds, radians and hertz elsewhere
 rig         | TOML | the rig, see rig.toml below
-tof_info    | JSON | model, serial, intrinsics, illuminator, modulation_hz, phase_rad, exposure, saturation, range_errors, offset, reach, noise
+tof_info    | JSON | what the driver says of the camera: intrinsics, channels, range errors
 stereo_info | JSON | model, serial, intrinsics of the point map's grid
 provenance  | JSON | versions, digests of inputs, seeds, UTC time
 """
@@ -190,17 +190,16 @@ def _table(header: str, rows: list[str]) -> str:
 
 def _section(layout: Layout) -> str:
     fields = [
-        f"| `/{f.path}` | {' or '.join(f.dtypes)} | {' x '.join(f.dims) or 'scalar'} | {f.units} | {f.doc}"
-        f"{' (optional)' * f.optional} |"
+        f"| `/{f.path}`{'?' * f.optional} | {' or '.join(f.dtypes)} | ({', '.join(f.dims)}) | {f.units} | {f.doc} |"
         for f in layout
     ]
-    attrs = [f"| `{name}` | {kind} | {doc} |" for name, kind, doc in layout.attrs]
+    shared = set(_rows(_DESCRIPTIONS))
+    own = [f"`{name}` ({doc})" for name, kind, doc in layout.attrs[2:] if (name, kind, doc) not in shared]
     return "\n".join(
         [
             f"## {layout.title}\n",
-            f'`format = "{layout.format}"`, `version = {layout.version}`.\n',
+            f'`format = "{layout.format}"`, `version = {layout.version}`, {", ".join(own)}.\n',
             _table("| dataset | dtype | shape | units | meaning |", fields),
-            _table("| attribute | kind | meaning |", attrs),
         ]
     )
 
@@ -214,8 +213,12 @@ def _bits(docs: Mapping[MaskBit, str] | Mapping[TofFlag, str]) -> str:
 def formats_markdown() -> str:
     """Print ``docs/formats.md`` from the layouts."""
     page = files("tofcapture.files").joinpath("formats.md").read_text(encoding="utf-8")
+    attrs = [f"| `{name}` | {kind} | {doc} |" for name, kind, doc in _rows(_DESCRIPTIONS)]
     return page.format(
-        layouts="\n".join(map(_section, (VIEW, SHARD))), mask=_bits(MASK_DOCS), flags=_bits(TOF_FLAG_DOCS)
+        layouts="\n".join(map(_section, (VIEW, SHARD))),
+        attrs=_table("| attribute | kind | meaning |", attrs),
+        mask=_bits(MASK_DOCS),
+        flags=_bits(TOF_FLAG_DOCS),
     )
 
 
