@@ -276,7 +276,7 @@ def test_evaluation_writes_the_agreed_results(dataset, trained, tmp_path):
     assert results["not_new"] == {
         "scene-2": "object scene"
     }  # scene-0, -1 and -2 are one object by their names
-    assert (results["format"], results["version"], results["split"]) == ("tofcapture-results", 1, "test")
+    assert (results["format"], results["version"], results["split"]) == ("tofcapture-results", 2, "test")
     assert (results["views"], results["frames"], results["scenes"]) == (3, 6, ["scene-2"])
     for method in ("sensor", "model"):
         table = results["methods"][method]

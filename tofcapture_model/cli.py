@@ -171,9 +171,8 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
 
 def _evaluate(args: argparse.Namespace) -> Outcome:
     _share_cores()
-    split = args.split or _usual_split(args.dataset)
     if args.suite:
-        return _suite(args, split)
+        return _suite(args)
     weights = _one_network(args.weights)
     with progress() as report, _no_going_on():
         report("load", 0, 0)
@@ -183,7 +182,7 @@ def _evaluate(args: argparse.Namespace) -> Outcome:
             args.dataset,
             weights,
             args.out,
-            split=split,
+            split=args.split,
             frames=1 if args.frames is None else args.frames,
             scenes=args.scenes,
             device=_checked_device(args.device),
@@ -193,21 +192,6 @@ def _evaluate(args: argparse.Namespace) -> Outcome:
     return Outcome(
         {**results, "results": str(args.out)}, f"{comparison(results)}\n{args.out}", following=following
     )
-
-
-def _usual_split(dataset: Path) -> str:
-    """Choose ``test``, or where a small dataset has none, the next best; say so then."""
-    from tofcapture.files.layout import SPLITS
-    from tofcapture.files.manifest import load_manifest
-
-    manifest = load_manifest(dataset)
-    split = next((name for name in reversed(SPLITS) if manifest.split(name)), "test")
-    if split != "test":
-        print(
-            f"tofcapture: {dataset}: no scene is in the split test, {split} is measured instead",
-            file=sys.stderr,
-        )
-    return split
 
 
 def _one_network(weights: Sequence[str] | None) -> Path | None:
@@ -236,7 +220,8 @@ def _no_going_on() -> Iterator[None]:
         raise Interrupted("interrupted", hint="nothing was kept: the same command begins anew") from err
 
 
-def _suite(args: argparse.Namespace, split: str) -> Outcome:
+def _suite(args: argparse.Namespace) -> Outcome:
+    from tofcapture_model.evaluation.evaluate import usual_split
     from tofcapture_model.evaluation.suite import read_weights, run_suite, seen_before
     from tofcapture_model.evaluation.tables import markdown
     from tofcapture_model.networks.checkpoint import find_model
@@ -247,7 +232,7 @@ def _suite(args: argparse.Namespace, split: str) -> Outcome:
             args.suite,
             read_weights(args.weights) if args.weights else {"bundled": [find_model(None)]},
             args.out,
-            split=split,
+            split=args.split or usual_split(args.dataset),
             frames=args.frames or 0,
             scenes=args.scenes,
             device=_checked_device(args.device),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,29 +13,32 @@ import torch
 from torch import Tensor
 
 from tofcapture.errors import ConfigError
+from tofcapture.files.layout import SPLITS
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.seal import PARTIAL, write_text
 from tofcapture_model.data import FrameDataset, SampleId, batched
-from tofcapture_model.evaluation.metrics import Score
-from tofcapture_model.frame import Frame, frame_to, target_to
+from tofcapture_model.evaluation.metrics import Score, regions
+from tofcapture_model.evaluation.objects import Objects, classes, find_support, told
+from tofcapture_model.frame import Frame, Target, frame_to, target_to
 from tofcapture_model.networks import Model
 from tofcapture_model.networks.baselines import sensor_estimate
 from tofcapture_model.networks.checkpoint import find_model, load_checkpoint, not_new, origin, sentence
 from tofcapture_model.networks.joint import JointModel
 
-FORMAT, VERSION = "tofcapture-results", 1
+FORMAT, VERSION = "tofcapture-results", 2  # 2: over the pixels of objects
 _EVERY = 7  # of how many good pixels a calibration looks at one
 
-Method = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
-"""Depth (B, 1, 2H, 2W), normals (B, 3, 2H, 2W), and where the method answers by itself."""
+Method = Callable[[Frame], tuple[Tensor, ...]]
+"""Depth (B, 1, 2H, 2W), normals (B, 3, 2H, 2W), where the method answers by itself, and what it says of its error, if it does."""
 
 
-def model_method(model: Model) -> Method:
-    """Wrap a model as a method; it answers everywhere."""
+def model_method(model: Model, *, sigma: bool = False) -> Method:
+    """Wrap a model as a method that answers everywhere; ``sigma``: what it says of its error is one standard deviation."""
 
-    def answer(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+    def answer(frame: Frame) -> tuple[Tensor, ...]:
         estimate = model(frame)
-        return estimate.depth, estimate.normals, torch.isfinite(estimate.depth)
+        error = (estimate.error,) if sigma else ()
+        return estimate.depth, estimate.normals, torch.isfinite(estimate.depth), *error
 
     return answer
 
@@ -45,8 +49,9 @@ def score(
     dataset: FrameDataset,
     device: torch.device,
     progress: Callable[[int, int], None] | None = None,
+    objects: Objects | None = None,
 ) -> tuple[dict[str, Score], int]:
-    """Run methods over all frames of a dataset.
+    """Run methods over all frames of a dataset: over the whole crop or, where ``objects`` are to be filled, over the pixels of objects.
 
     Returns scores by method, and how many frames were left out because no pixel of their ground truth is
     good.
@@ -55,13 +60,19 @@ def score(
     empty = 0
     for i, sample in enumerate(dataset.samples):
         frame = frame_to(batched(dataset.frame(sample)), device)
-        target = target_to(dataset.target(sample), device)
+        target = target_to(Target(*(x[None] for x in dataset.target(sample))), device)
+        where = {"crop": target.good}
+        if objects:
+            kinds = classes(target, frame.intrinsics, find_support(target, frame.intrinsics))
+            where = kinds | {"edge": kinds["object"] & regions(frame, target)["edge"]} | where
         empty += int(not target.good.any())
         for name, method in methods.items():
-            depth, normals, measured = method(frame)
-            scores[name].add(
-                depth, normals, target.depth[None], target.normals[None], target.good[None], measured
-            )
+            depth, normals, measured, *error = method(frame)
+            mask = where["object" if objects else "crop"]
+            scores[name].add(depth, normals, target.depth, target.normals, mask, measured)
+            if objects:
+                answer = depth, normals, error[0] if error else None
+                objects.add(sample.scene, name, answer, target, where)
         if progress:
             progress(i + 1, len(dataset.samples))
     return scores, empty
@@ -112,15 +123,15 @@ def evaluate(
     weights: str | Path | None,
     out: str | Path,
     *,
-    split: str = "test",
+    split: str | None = None,
     frames: int = 1,
     scenes: str = "",
     device: str = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Evaluate the sensor's own single frame and a model on a split, at twice the sensor's resolution, over mask == 0.
+    """Evaluate the sensor's own single frame and a model on a split, at twice the sensor's resolution, over the pixels of objects.
 
-    Returns what was written; lengths in metres.
+    Those have good ground truth (mask == 0), 4 mm and more above what the objects stand on. Returns what was written; lengths in metres.
 
     Raises :class:`ConfigError`: ``out`` cannot be written, or no scene of the split begins so.
 
@@ -133,7 +144,7 @@ def evaluate(
     out
         ``results.json``, written atomically.
     split
-        ``train``, ``val`` or ``test``.
+        ``train``, ``val`` or ``test``; ``None``: ``test`` or, where a small dataset has none, the next best.
     frames
         Frames of every view that are evaluated; 0: all.
     scenes
@@ -143,14 +154,16 @@ def evaluate(
     progress
         Called with (done, all).
     """
-    dataset = Path(dataset)
+    dataset, split = Path(dataset), split or usual_split(Path(dataset))
     expect_writable(Path(out))
     model, config, provenance = load_checkpoint(weights)
     model.to(device)
     data = FrameDataset(dataset, split, frames=frames)
     measured = take_scenes(data, split, scenes)
-    methods: dict[str, Method] = {"sensor": sensor_estimate, "model": model_method(model)}
-    scores, empty = score(methods, data, torch.device(device), progress)
+    sigma = isinstance(model, JointModel) and config.losses.uncertainty == "laplace"
+    methods: dict[str, Method] = {"sensor": sensor_estimate, "model": model_method(model, sigma=sigma)}
+    objects = Objects({name: reader.info.serial for name, reader in data.readers.items()})
+    scores, empty = score(methods, data, torch.device(device), progress, objects)
     reader = next(iter(data.readers.values()))
     results = {
         "format": FORMAT,
@@ -168,6 +181,7 @@ def evaluate(
         "training": origin(provenance),
         "not_new": not_new_of(provenance, dataset, split, measured),
         "methods": {name: s.table() for name, s in scores.items()},
+        **objects.table(),
     }
     data.close()
     write_results(Path(out), results)
@@ -190,6 +204,18 @@ def expect_writable(path: Path) -> None:
         raise ConfigError(
             f"--out {path}: cannot be written: {err.strerror}", hint="name a file where you may write"
         ) from err
+
+
+def usual_split(dataset: Path) -> str:
+    """Choose ``test``, or where a small dataset has none, the next best; say so then."""
+    manifest = load_manifest(dataset)
+    split = next((name for name in reversed(SPLITS) if manifest.split(name)), "test")
+    if split != "test":
+        print(
+            f"tofcapture: {dataset}: no scene is in the split test, {split} is measured instead",
+            file=sys.stderr,
+        )
+    return split
 
 
 def take_scenes(data: FrameDataset, split: str, prefix: str) -> list[str]:
@@ -219,7 +245,7 @@ def write_results(path: Path, results: dict[str, Any]) -> None:
 
 
 def comparison(results: dict[str, Any]) -> str:
-    """Table of the main columns for people, millimetres and degrees."""
+    """Tables for people, millimetres and degrees: the main columns, classes of pixels, the spread over objects, cameras."""
     rows = [
         f"{'method':8} {'MAE mm':>8} {'median':>8} {'RMSE':>8} {'ABS %':>7} {'normal deg':>11} {'>20 deg %':>10} {'coverage':>9}"
     ]
@@ -233,4 +259,5 @@ def comparison(results: dict[str, Any]) -> str:
             f" {n['mean_deg']:11.2f} {n['paper_bad20_pct']:10.2f} {100 * d['coverage']:8.1f}%"
         )
     said = sentence("model", results["not_new"], len(results["scenes"])) if "not_new" in results else ""
+    rows += told(results) if "classes" in results else []
     return "\n".join([*rows, said] if said else rows)

@@ -24,8 +24,16 @@ from tofcapture.files.manifest import manifest_path
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Losses
 from tofcapture_model.data import FrameDataset, batched, spare_memory
-from tofcapture_model.evaluation.evaluate import expect_writable, not_new_of, take_scenes, write_results
+from tofcapture_model.evaluation.evaluate import (
+    FORMAT,
+    VERSION,
+    expect_writable,
+    not_new_of,
+    take_scenes,
+    write_results,
+)
 from tofcapture_model.evaluation.metrics import Precision, Score, Uncertainty, regions
+from tofcapture_model.evaluation.objects import classes, find_support
 from tofcapture_model.evaluation.tables import SUITES, write_tables
 from tofcapture_model.frame import Frame, Target, frame_to, target_to
 from tofcapture_model.networks import Model
@@ -63,12 +71,12 @@ class Measured:
             self.scores.setdefault(name, Score()).add(
                 answer.depth, answer.normals, target.depth, target.normals, mask, answer.measured
             )
-        good, self.scaled = target.good, answer.scaled
+        good, self.scaled = where["all"], answer.scaled
         self.precision.add(answer.depth[good])
         self.uncertainty.add((answer.depth - target.depth)[good].abs(), answer.sigma[good])
 
     def table(self) -> dict[str, Any]:
-        """Both poolings of depth and normals of all pixels, the regions, repeatability and uncertainty."""
+        """Both poolings of depth and normals of all objects' pixels, of regions of them and of other classes, repeatability and uncertainty."""
         named = {name: score.table() for name, score in self.scores.items()}
         whole = named.pop("all")
         extra = self.precision.row() | self.uncertainty.row(scale=self.scaled)
@@ -171,7 +179,9 @@ def measure(
     for i, sample in enumerate(data.samples):
         frame = frame_to(batched(data.frame(sample)), device)
         target = target_to(Target(*(x[None] for x in data.target(sample))), device)
-        where = regions(frame, target)
+        kinds = classes(target, frame.intrinsics, find_support(target, frame.intrinsics))
+        where = {name: mask & kinds["object"] for name, mask in regions(frame, target).items()}
+        where |= {"crop": target.good, "sheet": kinds["sheet"], "support": kinds["support"]}
         if view != (view := (sample.scene, sample.view)):
             for one in found.values():
                 one.precision.close()
@@ -308,8 +318,8 @@ def measure_runs(
     data.close()
     table |= {name: averaged(found) for name, found in by_name.items()}
     return {
-        "format": "tofcapture-results",
-        "version": 1,
+        "format": FORMAT,
+        "version": VERSION,
         "dataset": str(dataset),
         "split": split,
         "scenes": measured,
