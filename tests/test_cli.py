@@ -51,31 +51,6 @@ def test_every_command_has_help_and_an_example_that_parses(name):
     parser({name: command}).parse_args(words[1:])
 
 
-@pytest.mark.parametrize(
-    ("words", "code"),
-    [
-        (["nonsense"], 2),
-        (["record"], 2),
-        (["check", "/no/such/path"], 5),
-        (["align", "/no/such/recording"], 5),
-        (["simulate", "/no/such/world.toml", "--out", "never.h5"], 3),
-        (["build-dataset", "/no/such/recording", "--out", "never"], 5),
-        (["train", "/no/such/dataset", "--out", "never"], 5),
-        (["evaluate", "/no/such/dataset", "--weights", "/no", "--out", "never.json"], 5),
-        (["predict", "/no/such/view.h5", "--weights", "/no", "--out", "never"], 5),
-    ],
-)
-def test_mistakes_have_their_exit_code_and_no_traceback(words, code, capsys, tmp_path, monkeypatch):
-    """Usage is 2, configuration 3, missing or damaged data 5; stderr is a sentence and a hint, and nothing is written."""
-    monkeypatch.chdir(tmp_path)
-    assert main(words) == code
-    assert not any(p.is_file() for p in tmp_path.rglob("*"))
-    said = capsys.readouterr().err
-    assert said.startswith("tofcapture: ")
-    assert "Traceback" not in said
-    assert len(said.splitlines()) <= 5
-
-
 def test_errors_are_json_when_asked(capsys):
     """With --json an error is one object on stdout."""
     code = main(["check", "/no/such/path", "--json"])
@@ -89,57 +64,6 @@ def test_no_command_prints_help(capsys):
     """``tofcapture`` alone shows the help and succeeds."""
     assert main([]) == 0
     assert "COMMAND" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("line", "named", "remedy"),
-    [
-        ("trian data", "'trian'", "train"),
-        ("biuld-dataset rec --out x", "'biuld-dataset'", "build-dataset"),
-        ("record --scen mug", "--scen ", "--scene"),
-        ("record --scene mug --out x --frame=3", "--frame ", "--frames"),
-        ("train data --out x --preset papr", "'papr'", "paper"),
-        ("calibrate hand-ey pairs.json", "'hand-ey'", "hand-eye"),
-        ("align rec --metod joint", "--metod ", "--method"),
-        ("predict a.h5 --averge", "--averge ", "--average"),
-    ],
-)
-def test_what_is_misspelt_is_named_and_what_was_meant_is_said(line, named, remedy, capsys):
-    """A wrong command, option or choice is named itself, before anything that is missing because of it."""
-    assert main(line.split()) == 2
-    said, hint = capsys.readouterr().err.splitlines()
-    assert named in f"{said} "
-    assert hint.startswith(f"  try: {remedy} instead")
-
-
-@pytest.mark.parametrize(
-    ("line", "wanted", "got"),
-    [
-        ("align data", "views of the board", "a dataset"),
-        ("build-dataset data --out x", "a recording", "a dataset"),
-        ("train data/shards/mug.h5 --out x", "a dataset", "a shard"),
-        ("evaluate rec", "a dataset", "a recording"),
-        ("stats rec/views/mug/view-000.h5", "a dataset", "a view file"),
-        ("pack run --out x", "a dataset", "the folder of a run"),
-        ("evaluate notes.txt", "a dataset", "a file .txt"),
-        ("evaluate .", "a dataset", "another folder"),
-    ],
-)
-def test_what_was_given_and_what_is_wanted_are_both_named(line, wanted, got, capsys, tmp_path, monkeypatch):
-    """A path of another kind is called what it is."""
-    monkeypatch.chdir(tmp_path)
-    for name in (
-        "data/shards/mug.h5",
-        "data/manifest.json",
-        "rec/views/mug/view-000.h5",
-        "run/model.safetensors",
-        "notes.txt",
-    ):
-        Path(name).parent.mkdir(parents=True, exist_ok=True)
-        Path(name).write_text("")
-    assert main(line.split()) == 5
-    said = capsys.readouterr().err
-    assert re.search(rf"expected .*{wanted}.*, got {re.escape(got)}\n", said), said
 
 
 def test_a_file_that_stands_in_the_way_of_a_package_is_named(tmp_path):

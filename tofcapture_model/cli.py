@@ -50,7 +50,7 @@ def _checked_device(name: str) -> str:
     try:
         torch.empty(0, device=name)
     except (RuntimeError, AssertionError) as err:
-        said = str(err).splitlines()[0]
+        said = str(err).splitlines()[0].partition(", ipu")[0]
         raise ConfigError(f"--device {name}: {said}", hint="--device cpu always works") from err
     return name
 

@@ -486,7 +486,7 @@ def _content(path: Path) -> Any:
             return {k: v.tolist() for k, v in loadmat(path).items() if not k.startswith("__")}
         return _of_text(decoded(path.read_bytes()), suffix, path)
     except FileNotFoundError as err:
-        raise DataError(f"{path}: no such file") from err
+        raise DataError(f"{path}: no such file", hint="look at the path and its folder") from err
     except (ValueError, OSError, EOFError, BadZipFile, NotImplementedError, ET.ParseError) as err:
         kinds = {".npz": "arrays of numbers", ".npy": "an array of numbers", ".json": "JSON", ".xml": "XML"}
         remedy = "arrays of (3, 1) or (N, 4, 4) numbers, no objects: np.savez(name, hand=np.array(hands, float), ...)"

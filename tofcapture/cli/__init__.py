@@ -60,13 +60,20 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> None:  # type: ignore[override]
         chosen = _INVALID_CHOICE.search(message)
         if chosen is None:
-            raise UsageError(message.removeprefix("argument "), hint=f"{self.prog} --help")
+            told = _INVALID_VALUE.sub(_expected, message.removeprefix("argument "))
+            raise UsageError(told, hint=f"{self.prog} --help")
         where, got, choices = chosen[1], chosen[2], re.findall(r"[\w.-]+", chosen[3])
         known = f"one of {', '.join(choices)}"
         raise UsageError(f"{where}: expected {known}, got {got!r}", hint=_meant(got, choices, self.prog))
 
 
 _INVALID_CHOICE = re.compile(r"argument (.+): invalid choice: '?(.*?)'? \(choose from (.+)\)")
+_INVALID_VALUE = re.compile(r"invalid (.+) value: (.+)")
+
+
+def _expected(said: re.Match[str]) -> str:
+    kind = {"int": "a whole number", "float": "a number"}.get(said[1], said[1])
+    return f"expected {kind}, got {said[2]}"
 
 
 def _meant(got: str, known: Iterable[str], program: str) -> str:
@@ -205,7 +212,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         with _notes_on_one_line(), _terminable():
             outcome = _run(argv)
     except TofError as err:
-        return _failed(type(err).__name__, err.message, err.hint, err.exit_code, as_json=as_json)
+        command = [word for word in argv if not word.startswith("-")][:1]
+        hint = err.hint or " ".join(["tofcapture", *command, "--help"])
+        return _failed(type(err).__name__, err.message, hint, err.exit_code, as_json=as_json)
     except _Terminated:
         hint = "run the same command again to go on"
         return _failed("Terminated", "terminated", hint, 143, as_json=as_json)
@@ -217,6 +226,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         if isinstance(err, ModuleNotFoundError):
             return _failed("Missing", *_missing(err), 3, as_json=as_json)
+        if isinstance(err, FileNotFoundError):
+            hint = "look at the path; it begins in the folder where you are"
+            return _failed("DataError", f"{err.filename}: no such file or folder", hint, 5, as_json=as_json)
+        if isinstance(err, NotADirectoryError | FileExistsError):
+            said = f"{err.filename}: expected a folder, got a file on the way"
+            return _failed("ConfigError", said, "name another folder", 3, as_json=as_json)
         from tofcapture.files.disk import is_full
 
         full = "free some space, then run the same command again"

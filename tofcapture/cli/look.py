@@ -36,6 +36,10 @@ def _view(args: argparse.Namespace) -> Outcome:
 
     if args.views is not None and args.views < 1:
         raise UsageError(f"--views: expected 1 or more, got {args.views}")
+    for option, path, ending in (("--png", args.png, ".png"), ("--save", args.save, ".rrd")):
+        if path and path.suffix != ending:
+            said = f"{option}: expected a name that ends in {ending}, got {path}"
+            raise UsageError(said, hint=f"{option} {path.with_suffix(ending)}")
     source = open_source(args.path)
     if args.png:
         return _written(source, args.png, args.views or _SHEET, as_sheet=True)

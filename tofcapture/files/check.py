@@ -56,7 +56,8 @@ def _check_folder(path: Path, tell: Tell) -> Iterator[Problem]:
         tell(path)
         yield from _check_cache(path)
     elif not recording and not dataset:
-        yield Problem(path, "", "expected a recording (views/) or a dataset (manifest.json), found neither")
+        wanted = "expected a recording (views/) or a dataset (manifest.json), found neither"
+        yield Problem(path, "", wanted, "give its own folder, or a view, a shard or a cache")
 
 
 def _check_recording(path: Path, tell: Tell) -> Iterator[Problem]:

@@ -64,7 +64,7 @@ def find_pieces(source: Path, said: Said) -> list[Piece]:
     Raises :class:`DataError`: it does not exist, or holds nothing that a reader reads.
     """
     if not source.exists():
-        raise DataError(f"{source}: no such file or folder")
+        raise DataError(f"{source}: no such file or folder", hint="look at the path and its folder")
     readers = [cast("Reader", import_module(f"tofcapture.importing.readers.{name}")) for name in READERS]
     found, passed = list[Piece](), list[str]()
     for path in _paths(source, readers):

@@ -82,7 +82,8 @@ def camera_keys(text: str) -> dict[str, Any]:
         ) from err
     if len(numbers) < 4:
         raise ConfigError(
-            f"--camera: expected at least fx,fy,cx,cy, got {len(numbers)} numbers", hint="pixels"
+            f"--camera: expected at least fx,fy,cx,cy, got {len(numbers)} numbers",
+            hint="190.6,200.8,116.8,101.5, in pixels",
         )
     lens = {"distortion": [*numbers[4:], *(0.0,) * (8 - len(numbers))]} if numbers[4:] else {}
     return {**dict(zip(ORDER, numbers, strict=False)), **lens}
@@ -96,6 +97,10 @@ def keys_of_file(path: Path, name: str = "") -> dict[str, Any]:
     found = cameras_of(path)
     if name in found:
         return found[name].keys
+    if not found:
+        raise ConfigError(
+            f"{path}: no camera in it", hint="rig.toml, Kalibr, ROS, OpenCV, COLMAP or nerfstudio"
+        )
     first = next(iter(found.values())).keys
     if name or any(one.keys != first for one in found.values()):
         raise ConfigError(
