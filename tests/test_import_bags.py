@@ -69,20 +69,9 @@ class Bag:
             data=np.frombuffer(data, np.uint8),
         )
 
-    def camera(self, topic, time, shape=SHAPE, frame="tof", fx=None):
-        K = np.array(
-            [
-                TOF["fx"] if fx is None else fx,
-                0,
-                TOF["cx"],
-                0,
-                TOF["fy"] if fx is None else fx,
-                TOF["cy"],
-                0,
-                0,
-                1.0,
-            ]
-        )
+    def camera(self, topic, time, shape=SHAPE, frame="tof", fx=None, tof=TOF):
+        fx, fy = (tof["fx"], tof["fy"]) if fx is None else (fx, fx)
+        K = np.array([fx, 0, tof["cx"], 0, fy, tof["cy"], 0, 0, 1.0])
         names = "DKRP" if self.form == "ros1" else "dkrp"
         held = dict(zip(names, (np.zeros(5), K, np.eye(3).ravel(), np.zeros(12)), strict=True))
         roi = self.kind("sensor_msgs/msg/RegionOfInterest")(
@@ -99,6 +88,34 @@ class Bag:
         link = self.kind("geometry_msgs/msg/Transform")(vector, turn)
         one = self.kind("geometry_msgs/msg/TransformStamped")(self.header(time, parent), child, link)
         self.add("/tf", "tf2_msgs/msg/TFMessage", time, transforms=[one])
+
+    def pose(self, kind, time, xyz, frame="world", child=""):
+        """A pose turned by 90 degrees about z, as PoseStamped, Odometry or TransformStamped."""
+        half, name = np.sqrt(0.5), f"geometry_msgs/msg/{kind}"
+        point = self.kind("geometry_msgs/msg/Point")(*map(float, xyz))
+        turn, head = self.kind("geometry_msgs/msg/Quaternion")(0.0, 0.0, half, half), self.header(time, frame)
+        pose = self.kind("geometry_msgs/msg/Pose")(point, turn)
+        if kind == "PoseStamped":
+            self.add("/tracker", name, time, header=head, pose=pose)
+        elif kind == "TransformStamped":
+            link = self.kind("geometry_msgs/msg/Transform")(
+                self.kind("geometry_msgs/msg/Vector3")(*map(float, xyz)), turn
+            )
+            self.add("/vicon", name, time, header=head, child_frame_id=child, transform=link)
+        else:
+            zero = self.kind("geometry_msgs/msg/Vector3")(0.0, 0.0, 0.0)
+            twist = self.kind("geometry_msgs/msg/Twist")(zero, zero)
+            self.add(
+                "/odom", "nav_msgs/msg/Odometry", time, header=head, child_frame_id=child,
+                pose=self.kind("geometry_msgs/msg/PoseWithCovariance")(pose, np.zeros(36)),
+                twist=self.kind("geometry_msgs/msg/TwistWithCovariance")(twist, np.zeros(36)),
+            )  # fmt: skip
+
+    def joints(self, time, angles, names):
+        self.add(
+            "/joint_states", "sensor_msgs/msg/JointState", time, header=self.header(time, ""), name=list(names),
+            position=np.array(angles, float), velocity=np.zeros(0), effort=np.zeros(0),
+        )  # fmt: skip
 
     def cloud(self, topic, time, points, frame="stereo"):
         H, W = points.shape[:2]
@@ -270,6 +287,83 @@ def test_some_lost_messages_are_left_out_aloud(tmp_path):
         assert len(imported(path, tmp_path / "rec", tof={})) == 9
 
 
+UR = ("elbow", "shoulder_lift", "shoulder_pan", "wrist_1", "wrist_2", "wrist_3")  # as ROS sorts them
+
+
+def posed(kind, offset=0, child="tof", frame="world"):
+    """Poses of a moving camera as messages instead of tf, between the frames; a clock that is late by ``offset``."""
+
+    def change(bag):
+        bag.rows[:] = [r for r in bag.rows if r[0] != "/tf"]
+        for i in range(-1, 5):
+            time = START + i * S // 10 - S // 20 - offset
+            bag.pose(kind, time, (0.1 * i - 0.05, 0.2, 0.3), frame, child)
+            bag.joints(time, [*np.arange(6) + 0.1 * i - 0.05, 0.5], [f"{n}_joint" for n in (*UR, "finger")])
+
+    return change
+
+
+@pytest.mark.parametrize("form", ["sqlite3", "mcap", "ros1"])
+@pytest.mark.parametrize("kind", ["PoseStamped", "Odometry", "TransformStamped"])
+def test_messages_of_poses_place_the_camera_and_joints_are_the_arms(tmp_path, form, kind):
+    """Between their stamps they are interpolated, with the offset of their clock; joints come in the order from the base on."""
+    path = written(tmp_path / "mug", form, change=posed(kind, S // 4))
+    found = imported(path, tmp_path / "rec", tof={}, poses={"time_offset_s": 0.25})
+    for i, view in enumerate(found):
+        T, joints = view.arm_before.T_base_flange, view.arm_before.joints
+        np.testing.assert_allclose(T[:3, 3], [0.1 * i, 0.2, 0.3], atol=1e-9)
+        np.testing.assert_allclose(T[:3, 0], [0, 1, 0], atol=1e-9)
+        np.testing.assert_allclose(joints, np.array([2, 1, 0, 3, 4, 5]) + 0.1 * i, atol=1e-6)
+
+
+def test_odometry_carries_the_camera_on_its_robot(tmp_path):
+    """It moves the frame that tf hangs the camera on."""
+
+    def change(bag):
+        posed("Odometry", child="base_link", frame="odom")(bag)
+        bag.tf(START, "base_link", "tof", (0.5, 0, 0))
+
+    found = imported(written(tmp_path / "mug", change=change), tmp_path / "rec", tof={})
+    np.testing.assert_allclose(found[1].arm_before.T_base_flange[:3, 3], [0.1, 0.7, 0.3], atol=1e-9)
+
+
+def test_a_topic_of_poses_is_chosen(tmp_path):
+    """Two trackers ask which is meant; one that tf leaves unused is told."""
+
+    def two(bag):
+        for kind in ("PoseStamped", "TransformStamped"):
+            posed(kind, child="helmet")(bag)
+
+    path = written(tmp_path / "mug", change=two)
+    with pytest.raises(TofError, match="/tracker, /vicon") as info:
+        import_data([path], tmp_path / "rec", Said())
+    assert info.value.hint.startswith('[poses] file = "/')
+    with pytest.raises(TofError, match="expected PoseStamped or Odometry"):
+        import_data([path], tmp_path / "rec", Said(poses={"file": "/none"}))
+    with pytest.warns(PassedOver, match="poses of helmet"):
+        assert len(imported(path, tmp_path / "rec", tof={}, poses={"file": "/vicon"})) == 3
+
+    def still(bag):
+        posed("PoseStamped")(bag)
+        bag.tf(START, "tool0", "tof", (0, 0, 0.1))
+
+    with pytest.warns(PassedOver, match="stand still on tool0"):
+        imported(written(tmp_path / "box", change=still), tmp_path / "still", tof={})
+
+
+def test_tf_of_many_nodes_that_stands_still(tmp_path):
+    """Every node publishes it again on /tf_static, long before the frames."""
+
+    def change(bag):
+        bag.rows[:] = [r for r in bag.rows if r[0] != "/tf"]
+        for k in range(3):
+            bag.tf(START - (9 - k) * S, "base", "tof", (0.4, 0, 0))
+        bag.rows[:] = [("/tf_static" if r[0] == "/tf" else r[0], *r[1:]) for r in bag.rows]
+
+    found = imported(written(tmp_path / "mug", change=change), tmp_path / "rec", tof={})
+    np.testing.assert_allclose([v.arm_before.T_base_flange[0, 3] for v in found], 0.4)
+
+
 def without(*words):
     def change(bag):
         bag.rows[:] = [r for r in bag.rows if not any(w in r[0] for w in words)]
@@ -310,6 +404,13 @@ def zeros(bag):
     bag.camera("/tof/camera_info", START, fx=0.0)
 
 
+def lost(bag):
+    posed("PoseStamped")(bag)
+    for topic, _, time, message in bag.rows:
+        if topic == "/tracker" and time > START:
+            message.pose.orientation.z = message.pose.orientation.w = 0.0
+
+
 WRONG = {
     "empty": (lambda b: b.rows.clear(), {}, "no message at all", "info"),
     "no images": (without("raw", "depth"), {}, "/tf \\(TFMessage\\)", "info"),
@@ -322,6 +423,13 @@ WRONG = {
         "1e.03 times as fast",
         "received",
     ),
+    "a clock that was set back": (
+        stamped(lambda i, t: {"sec": (START // S if t == START else 1000) + i, "nanosec": 0}),
+        {},
+        "they go back by",
+        "clock set",
+    ),
+    "a tracker that lost it": (lost, {}, "got NaN or a quaternion of length 0", "tracker"),
     "other clocks": (
         stamped(lambda i, t: {"sec": 5, "nanosec": t % S}),
         {},

@@ -117,6 +117,36 @@ def _write(form, folder, raw, depth):
         for i in range(len(raw)):
             arrays = {"raw": np.moveaxis(raw[i], 0, -1), "depth": depth[i]}
             _matlab(folder / f"view{i}.mat", arrays, seven_three=form == "mat73")
+    elif form == "mat-struct":
+        for i in range(len(raw)):
+            held = {"raw": np.moveaxis(raw[i], 0, -1), "depth": depth[i]}
+            _matlab(folder / f"view{i}.mat", {"data": held})
+    elif form == "mat-cells":
+        cells = {n: np.empty(len(raw), object) for n in ("raw", "depth")}
+        for i in range(len(raw)):
+            cells["raw"][i], cells["depth"][i] = np.moveaxis(raw[i], 0, -1), depth[i]
+        _matlab(folder / "mug.mat", cells)
+    elif form == "mat73-cells":
+        _matlab(folder / "mug.mat", {}, seven_three=True)
+        with h5py.File(folder / "mug.mat", "r+") as file:
+            for name, held in (("raw", [np.moveaxis(r, 0, -1) for r in raw]), ("depth", depth)):
+                refs = [file.create_dataset(f"#refs#/{name}{i}", data=x.T).ref for i, x in enumerate(held)]
+                file.create_dataset(name, (len(refs), 1), h5py.ref_dtype)[:, 0] = refs
+    elif form == "pages":
+        cv2 = pytest.importorskip("cv2")
+        for i in range(len(raw)):
+            cv2.imwritemulti(str(folder / f"raw{i}.tiff"), list(raw[i]))
+        np.save(folder / "depth.npy", depth)
+    elif form == "organised":
+        head = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        head += f"WIDTH {SHAPE[1]}\nHEIGHT {SHAPE[0]}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {SHAPE[0] * SHAPE[1]}\nDATA ascii\n"
+        for i in range(len(raw)):
+            np.save(folder / f"raw_{i}.npy", raw[i])
+            points = depth[i][..., None].astype(float) * _rays(points=True)
+            with (folder / f"cloud_{i}.pcd").open("w") as file:
+                file.write(head)
+                np.savetxt(file, points.reshape(-1, 3), fmt="%.9g")
+        return {"truth": {"T_tof_truth": np.eye(4).tolist()}}
     elif form == "mat-scene":
         _matlab(
             folder / "mug.mat", {"raw": np.moveaxis(raw, (0, 1), (3, 2)), "depth": np.moveaxis(depth, 0, -1)}
@@ -158,7 +188,7 @@ def _write(form, folder, raw, depth):
 
 
 FORMS = (
-    "npy", "big-endian", "npz", "npz-scene", "mat", "mat73", "mat-scene", "hdf5", ".png", ".tif", "millimetres", "turned", "folders", "words", "points",
+    "npy", "big-endian", "npz", "npz-scene", "mat", "mat73", "mat-scene", "mat-struct", "mat-cells", "mat73-cells", "pages", "organised", "hdf5", ".png", ".tif", "millimetres", "turned", "folders", "words", "points",
 )  # fmt: skip
 
 
@@ -268,6 +298,39 @@ def wrong(folder):
             lambda: (folder / "raw.raw").write_bytes(b"\0\1" * 999) and {"raw": {"shape": [30, 40]}}, "multiple of 30 x 40", "rows"
         ),
         "axes of nobody": (lambda: put(raw_={"axes": "XYZ"}), "axes that name", "HWK"),
+        "bytes in the other order": (lambda: put(raw.byteswap()), "", "byteswap"),
+        "a constant image": (lambda: put(np.full_like(raw, 1500)), "no modulated light", ""),
+        "complex phasors": (lambda: put(raw[:, :4] + 1j * raw[:, 4:]), "got complex", "z.imag"),
+        "true and false": (lambda: put(raw > 1500), "more than 8 bits", "16 bits"),
+        "a channel's file missing": (
+            lambda: none(*(np.save(folder / f"v{i}_c{k}.npy", raw[i, k]) for i in range(3) for k in range(8) if (i, k) != (1, 3))),
+            "none numbered 1-3", "missing"
+        ),
+        "half of the channels' files": (
+            lambda: none(*(np.save(folder / f"v{i}_c{k}.npy", raw[i, k]) for i in range(3) for k in range(0, 8, 2))),
+            "multiple of 8 images", "missing"
+        ),
+        "one image of all channels": (lambda: none(*(np.save(folder / f"raw_{i}.npy", r.reshape(-1, SHAPE[1])) for i, r in enumerate(raw))), "multiple of 8", "part them"),
+        "other numbers": (lambda: none(put(), (folder / "raw_1.npy").unlink(), (folder / "depth_2.npy").unlink()), "not in step: raw has 2 alone, ground truth 1", "partner"),
+        "a cut PNG": (lambda: none(put(), _png(folder / "depth_1.png", (depth[1] * 1000).astype(np.uint16)), _cut(folder / "depth_1.png"), (folder / "depth_1.npy").unlink()), "depth_1.png", "again"),
+        "depth as JPEG": (lambda: none(put(d=None), (folder / "depth_0.jpg").write_bytes(b"\xff\xd8")), "got depth_0.jpg", "JPEG loses"),
+        "depth as EXR": (lambda: none(put(d=None), (folder / "depth_0.exr").write_bytes(b"v/1")), "got depth_0.exr", "np.save"),
+        "depth marked by -1": (lambda: put(d=np.where(depth > 1, -1, depth)), "behind it", "missing = [-1]"),
+        "depth along the rays": (lambda: put(d=depth * _rays()), "mm off", 'kind = "radial"'),
+        "depth in feet": (lambda: put(d=depth / 0.3048), "mm off", "inches or feet"),
+        "points with y up": (
+            lambda: put(d=depth[..., None] * _rays(points=True) * [1, -1, 1], truth={"T_tof_truth": identity}), "fy -46", "y runs the other way"
+        ),
+        "a MAT of text": (lambda: none((folder / "raw.mat").write_text("# Created by Octave\n# name: raw\n")), "raw.mat", "again"),
+        "a MAT of words": (lambda: none(_matlab(folder / "raw.mat", {"name": "mug"})), "raw.mat without arrays", "np.save"),
+        "poses of NaN": (lambda: _poses(folder, put, "0 0 0 0 0 0 1\n" + "nan " * 7 + "\n0 0 0 0 0 0 1\n"), "pose 2: expected finite", "lost"),
+        "left-handed poses": (lambda: _poses(folder, put, "1 0 0 0 0 1 0 0 0 0 -1 0\n" * 3), "right-handed", ""),
+        "poses in mm": (lambda: _poses(folder, put, "".join(f"{300 * i} 0 0 0 0 0 1\n" for i in range(3))), "lie 600 m apart", 'unit = "mm"'),
+        "poses of another clock": (
+            lambda: none(*(np.save(folder / f"raw_{1700000000 + i}.500000.npy", r) for i, r in enumerate(raw)))
+            or _poses(folder, none, "".join(f"{i} 0 0 0 0 0 0 1\n" for i in range(3))), "within 0.1 s", "time_offset_s"
+        ),
+        "poses of COLMAP": (lambda: _poses(folder, put, "1 1 0 0 0 0 0 0 1 raw_0.npy\n\n" * 3), "line 1", "x y z qx qy qz qw"),
         "a layout of nobody": (lambda: put(raw_={"layout": "acme"}), "arducam-b0410", ""),
         "a kind of nobody": (lambda: put(truth={"kind": "disparity"}), "kind", ""),
         "poses too few": (lambda: _poses(folder, put, "0 0 0 0 0 0 1\n"), "a pose for each of 3 views, got 1", "one line"),
@@ -286,7 +349,76 @@ def _poses(folder, put, text):
     return {"poses": {"file": "poses.txt"}}
 
 
+def _cut(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _rays(*, points=False):
+    """Lengths (H, W) of the pixels' rays, or the rays."""
+    v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
+    rays = np.stack([(u - TOF["cx"]) / TOF["fx"], (v - TOF["cy"]) / TOF["fy"], 1.0 + 0 * u], axis=-1)
+    return rays if points else np.linalg.norm(rays, axis=-1)
+
+
 NAMES = list(wrong(None))
+
+
+def test_frames_that_are_copies_are_told(tmp_path):
+    """A driver that stood still gives the same frame again: it is imported, and named."""
+    raw, depth = scenes()
+    np.save(tmp_path / "raw.npy", raw[[0, 1, 0]][:, None])
+    np.save(tmp_path / "depth.npy", depth[[0, 1, 0]])
+    found = import_data([tmp_path], tmp_path / "rec", Said(tof=TOF))
+    assert [w.split(": ")[1] for w in found.warnings] == ["view 2, frame 0 is view 0, frame 0, bit for bit"]
+
+
+FIELD = {  # as tools of the field name and keep their files
+    "stamps of a camera's recorder": lambda i: (f"Phase{{k}}_{1700000000123.456 + 33.3 * i:.12f}.png", f"Depth_{1700000000123.456 + 33.3 * i:.12f}.png"),
+    "a stamp for each image": lambda i: (f"Phase{{k}}_{{{1700000000123 + 1000 * i} + 3 * k}}.png", f"Depth_{1700000000123 + 1000 * i}.png"),
+    "a running number": lambda i: (f"frame_{{{8 * i} + k:06d}}.png", f"depth_{8 * i:06d}.png"),
+    "frequency and phase": lambda i: (f"img{i:03d}_{{20 + 80 * (k // 4)}}MHz_{{90 * (k % 4)}}deg.png", f"img{i:03d}_depth.png"),
+    "one tall image": lambda i: (f"raw_{i:04d}.png", f"depth_{i:04d}.png"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FIELD)
+def test_names_of_the_field_are_understood(tmp_path, name):
+    """Views, channels and their depths come together as they were taken."""
+    raw, depth = scenes()
+    folder = tmp_path / "mug"
+    folder.mkdir()
+    for i in range(3):
+        taps, z = FIELD[name](i)
+        for k in range(8):
+            image = raw[i].reshape(-1, SHAPE[1]) if "tall" in name else raw[i, k]
+            _png(folder / eval(f"f{taps!r}", {"k": k}), image)  # noqa: S307
+        _png(folder / z, np.rint(1000 * depth[i]).astype(np.uint16))
+    size = {"width": SHAPE[1], "height": SHAPE[0]}
+    views = imported(folder, tmp_path / "rec", tof={**TOF, **size}, truth={"unit": "mm"})
+    assert len(views) == 3
+    for i, view in enumerate(views):
+        np.testing.assert_array_equal(view.tof.raw[0], raw[i])
+        np.testing.assert_allclose(view.stereo.points[..., 2], depth[i], atol=6e-4)
+
+
+@pytest.mark.parametrize("unit", [1, 1000, 10**9])
+def test_a_trajectory_of_stamps_places_views_by_the_stamps_of_their_names(tmp_path, unit):
+    """TUM at 50 Hz in seconds, milliseconds or nanoseconds, interpolated; a header may change the columns' order."""
+    raw, depth = scenes()
+    for i in range(3):
+        np.save(tmp_path / f"raw_{1700000000 + i}.505000.npy", raw[i])
+        np.save(tmp_path / f"depth_{i}.npy", depth[i])
+    lines = [f"{unit * (1700000000 * 50 + i) // 50},1,0,0,0,{0.02 * i},0,0\n" for i in range(200)]
+    (tmp_path / "poses.csv").write_text(
+        "t,qw,qx,qy,qz,x,y,z\n" + "".join(lines)
+        if unit > 1
+        else "stamp px py pz qx qy qz qw\n"
+        + "".join(f"{1700000000 + 0.02 * i:.2f} {0.02 * i} 0 0 0 0 0 1\n" for i in range(200))
+    )
+    views = imported(tmp_path, tmp_path / "rec", poses={"file": "poses.csv"})
+    np.testing.assert_allclose(
+        [v.arm_before.T_base_flange[0, 3] for v in views], [0.505, 1.505, 2.505], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)

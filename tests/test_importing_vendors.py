@@ -41,11 +41,16 @@ def arducam_b0410():
 def arducam_b0548_double(pitch=481):
     """Eight images of 16 bits in 4810 rows, metadata between them."""
     raw = frames([90, 15], [0, 90, 180, 270], (480, 640), middle=1800)
+    return raw, b0548_rows(raw, pitch).tobytes()
+
+
+def b0548_rows(raw, pitch=481):
+    """Rows of two halves, each four images after a line of metadata."""
     rows = np.full((2, 2405, 640), 7, dtype="<u2")
     for half, images in zip(rows, raw.reshape(2, 4, 480, 640), strict=True):
         for k, image in enumerate(images):
             half[1 + k * pitch : 1 + k * pitch + 480] = image
-    return raw, rows.tobytes()
+    return rows
 
 
 def azure_kinect():
@@ -82,6 +87,11 @@ def kinect_v2():
 def luxonis():
     """Two frames of raw10, a tap in each corner of 2 x 2 cells, 80 and 100 MHz in turn."""
     raw = frames([80, 100], [0, 90, 180, 270], (480, 640), middle=500)
+    return raw, luxonis_words(raw)
+
+
+def luxonis_words(raw):
+    """Mosaics of eight images."""
     out = b""
     for taps in raw.reshape(2, 4, 480, 640):
         mosaic = np.zeros((962, 1280), np.int64)
@@ -90,7 +100,7 @@ def luxonis():
         four = mosaic.reshape(-1, 4)
         low = sum((four[:, i] & 3) << 2 * i for i in range(4))
         out += np.column_stack([four >> 2, low]).astype(np.uint8).tobytes()
-    return raw, out
+    return out
 
 
 def femto_picture(raw, mhz, padded=True, each=True):
@@ -158,7 +168,8 @@ def test_bytes_come_apart_into_the_images_that_went_in(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["arducam-b0410", "arducam-b0548-double", "femto-bolt", "luxonis-oak-tof", "ti-opt8241"]
+    "name",
+    ["arducam-b0410", "arducam-b0548-double", "femto-bolt", "luxonis-oak-tof", "ti-opt8241", "espros"],
 )
 def test_a_file_of_bytes_becomes_a_view(name, tmp_path):
     """The layout is known by its size or by its name; the view has its images and channels."""
@@ -166,7 +177,9 @@ def test_a_file_of_bytes_becomes_a_view(name, tmp_path):
     (tmp_path / "frame.raw").write_bytes(data)
     H, W = raw.shape[1:]
     tof = {"fx": W, "fy": W, "cx": W / 2, "cy": H / 2}
-    said = Said(tof=tof, raw={} if name in KNOWN_BY_SIZE else {"layout": name})
+    size = {"espros": {"shape": [H, W]}}.get(name, {})
+    channels = {"espros": {"modulation_mhz": [12], "phase_deg": [0, 90, 180, 270]}}.get(name, {})
+    said = Said(tof=tof | channels, raw={} if name in KNOWN_BY_SIZE else {"layout": name, **size})
     import_data([tmp_path / "frame.raw"], tmp_path / "rec", said)
     (path,) = find_views(tmp_path / "rec")["frame"]
     view = open_view(path)

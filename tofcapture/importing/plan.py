@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from functools import partial
+from itertools import product
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,7 @@ class Planned:
     time_ns: tuple[int, ...] = ()  #: Stamps of the frames, if the source has them.
     T_world_tof: Any = None  #: (4, 4) pose of the camera, if the source has it.
     T_tof_truth: Any = None  #: (4, 4) from the frame of the ground truth, if the source has it.
+    joints: Any = None  #: (6,) angles of the arm, if the source has them.
 
 
 @dataclass(frozen=True)
@@ -144,8 +146,8 @@ def plan(source: Path, said: Said) -> list[Planned]:
 
 def _posed(views: list[Planned], pieces: list[Piece], said: Said, source: Path) -> list[Planned]:
     """Give views the poses that ``[poses] file`` or the source itself has."""
-    if file := said.poses.get("file"):
-        path = (source if source.is_dir() else source.parent) / str(file)
+    path = (source if source.is_dir() else source.parent) / str(said.poses.get("file", ""))
+    if said.poses.get("file") and (path.is_file() or not all(v.T_world_tof is not None for v in views)):
         stamps, poses = read_poses(path, said)
         where = str(path)
     elif pieces and all(p.T is not None for p in pieces):
@@ -184,8 +186,11 @@ def _named(piece: Piece, said: Said) -> _Named:
 
 
 def _taken_apart(named: _Named, said: Said) -> _Named:
-    """Read an array that holds a camera's bytes by its layout; files of bytes are read so already."""
+    """Read an array that holds a camera's bytes by its layout; files of bytes are read so already. Part channels in one image."""
     layout, piece = str(said.raw.get("layout", "")), named.piece
+    if not layout and not said.raw.get("axes"):
+        K, size = len(said.channels(piece.facts)[0]), said.size(piece.facts)
+        return replace(named, piece=replace(piece, load=partial(_parted, piece.load, K, size)))
     if not layout or piece.facts.model == layout:
         return named
     shape = tuple(map(int, said.tuple_of("raw", "shape")))
@@ -194,6 +199,16 @@ def _taken_apart(named: _Named, said: Said) -> _Named:
         return decode(piece.load().tobytes(), layout, shape, str(piece.path))
 
     return replace(named, piece=replace(piece, load=load, facts=piece.facts.over(facts_of_layout(layout))))
+
+
+def _parted(load: Callable[[], Array], K: int, size: tuple[int, int] | None) -> Array:
+    """Part an image (K H, W) or (H, K W) of all channels below or beside each other into (K, H, W), where the size is said."""
+    image = load()
+    if image.ndim == 2 and size and image.shape == (K * size[0], size[1]):
+        return image.reshape(K, *size)
+    if image.ndim == 2 and size and image.shape == (size[0], K * size[1]):
+        return np.moveaxis(image.reshape(size[0], K, size[1]), 1, 0)
+    return image
 
 
 def _scenes(named: Sequence[_Named], said: Said, source: Path) -> dict[str, list[_Named]]:
@@ -320,7 +335,9 @@ def _planned(
     facts = Facts()
     for piece in pieces:
         facts = facts.over(piece.facts)
-    stamps = tuple(p.time_ns for p in pieces if p.time_ns is not None)
+    stamps = tuple(
+        t for t in (p.time_ns if p.time_ns is not None else stamp_in(p.name) for p in pieces) if t is not None
+    )
     return Planned(
         "", 0, raw, facts,
         truth or (target.load if target else None),
@@ -329,7 +346,16 @@ def _planned(
         stamps if len(stamps) == len(pieces) else (),
         next((p.T for p in pieces if p.T is not None), None),
         target.T if target else None,
+        next((p.joints for p in pieces if p.joints is not None), None),
     )  # fmt: skip
+
+
+def stamp_in(name: str) -> int | None:
+    """Read a stamp since 1970 in a name, nanoseconds: seconds with a fraction, milli-, micro- or nanoseconds."""
+    found = re.search(
+        r"(?<!\d)(1\d{9})(?:\.(\d+)|(\d{3}|\d{6}|\d{9}))(?!\d)", Path(name.partition(":")[0]).stem
+    )
+    return found and int(found[1] + (found[2] or found[3]).ljust(9, "0")[:9])
 
 
 def _grouped(raw: list[_Named], said: Said, K: int) -> dict[Key, list[Piece]]:
@@ -345,10 +371,14 @@ def _grouped(raw: list[_Named], said: Said, K: int) -> dict[Key, list[Piece]]:
     if len({len(n.numbers) for n in raw}) > 1 or len(raw) == 1:
         return _in_turn(raw, need)
     columns = [[n.numbers[i] for n in raw] for i in range(len(raw[0].numbers))]
-    varying = [i for i, column in enumerate(columns) if len({v for _, v in column}) > 1]
-    many = {i: len({v for _, v in columns[i]}) for i in varying}
-    if prod(many.values()) != len(raw):
-        return _in_turn(raw, need)
+    many = {i: len({v for _, v in column}) for i, column in enumerate(columns)}
+    varying = list[int]()
+    for i, column in enumerate(columns):
+        # A number that says what one before it says, as seconds and their fraction in a stamp do, counts once.
+        told = any(len(set(zip(columns[j], column, strict=True))) == many[i] == many[j] for j in varying)
+        varying += [i] if many[i] > 1 and not told else []
+    if prod(many[i] for i in varying) != len(raw):
+        return _in_turn(raw, need, _gaps(columns, varying))
     inner = _channel_columns(varying, many, columns, need) if need > 1 else []
     if need > 1 and not inner:
         return _in_turn(raw, need)
@@ -372,13 +402,37 @@ def _channel_columns(
     return next((o for o in options if o and prod(many[i] for i in o) == K), [])
 
 
-def _in_turn(raw: list[_Named], each: int) -> dict[Key, list[Piece]]:
+def _gaps(columns: list[list[tuple[str, int]]], varying: list[int]) -> list[str]:
+    """Name the numbers that names would have if none was missing, where few are."""
+    there = set(zip(*([v for _, v in columns[i]] for i in varying), strict=True))
+    if prod(len({k[i] for k in there}) for i in range(len(varying))) > 2 * len(there):
+        return []
+    gone = [
+        k for k in product(*(sorted({k[i] for k in there}) for i in range(len(varying)))) if k not in there
+    ]
+    return ["-".join(map(str, k)) for k in gone]
+
+
+def _in_turn(raw: list[_Named], each: int, gaps: Sequence[str] = ()) -> dict[Key, list[Piece]]:
+    """Take pieces as they come; a group is known by the numbers of its first, where these tell groups apart."""
+    stamps = [stamp_in(n.piece.name) for n in raw]
+    if None not in stamps and len(set(stamps)) == len(stamps):  # each image has its own
+        raw = [n for _, n in sorted(zip(stamps, raw, strict=True), key=lambda s: s[0] or 0)]
     if len(raw) % each:
+        tall = raw[0].piece.load()
         raise DataError(
-            f"{raw[0].piece.path.parent}: expected a multiple of {each} images, one a channel, got {len(raw)}",
-            hint="is a file missing, or are there other channels? [tof] modulation_mhz and phase_deg in import.toml say which",
+            f"{raw[0].piece.path.parent}: expected a multiple of {each} images, one a channel, got {len(raw)}"
+            + (f"; there is none numbered {_some(gaps)}" if gaps else ""),
+            hint="are the channels below each other in one image? [tof] width and height in import.toml part them"
+            if tall.ndim == 2 and max(tall.shape) >= 2 * min(tall.shape)
+            else "is a file missing, or are there other channels? [tof] modulation_mhz and phase_deg in import.toml say which",
         )
-    return {(i,): [n.piece for n in raw[i * each : (i + 1) * each]] for i in range(len(raw) // each)}
+    firsts = [tuple(v for _, v in n.numbers) for n in raw[::each]]
+    known = len(set(firsts)) == len(firsts)
+    return {
+        firsts[i] if known else (i,): [n.piece for n in raw[i * each : (i + 1) * each]]
+        for i in range(len(firsts))
+    }
 
 
 def _paired(groups: Mapping[Key, Any], truth: list[_Named], source: Path) -> list[Piece | None]:
@@ -388,6 +442,9 @@ def _paired(groups: Mapping[Key, Any], truth: list[_Named], source: Path) -> lis
     truth = sorted(truth, key=lambda n: natural(n.piece.name))
     if len(truth) == 1 and truth[0].piece.path.suffix.lower() in SURFACES:  # one surface that all views see
         return [truth[0].piece] * len(groups)
+    if len(truth) == 1 and len(groups) == len(held := truth[0].piece.load()) and held.ndim > 2:
+        piece = truth[0].piece  # one file of all depths
+        return [replace(piece, load=partial(_part, piece.load, i)) for i in range(len(groups))]
     if len(truth) > len(groups):
         spare = [
             n.piece.name for n in truth if tuple(v for _, v in n.numbers)[-1:] not in {k[-1:] for k in groups}
@@ -402,6 +459,7 @@ def _paired(groups: Mapping[Key, Any], truth: list[_Named], source: Path) -> lis
         if len(known) == len(truth) and set(groups) <= set(known):
             return [known[k] for k in groups]
     if len(truth) == len(groups):
+        _expect_one_step(list(groups), [tuple(v for _, v in n.numbers) for n in truth], source)
         return [n.piece for n in truth]
     missing = [".".join(map(str, k)) for k in groups if k not in short and k not in keys]
     raise DataError(
@@ -409,6 +467,30 @@ def _paired(groups: Mapping[Key, Any], truth: list[_Named], source: Path) -> lis
         + (f"; there is none for {_some(missing)}" if missing else ""),
         hint='copy the missing files, or import without ground truth: [truth] kind = "none" in import.toml',
     )
+
+
+def _expect_one_step(raw: list[Key], truth: list[Key], source: Path) -> None:
+    """Refuse pairs by order where numbers of both say that others belong together: they do not run side by side."""
+
+    def columns(keys: list[Key]) -> list[Array]:
+        table = np.array(keys, dtype=np.float64) if len({len(k) for k in keys}) == 1 else np.empty((0, 0))
+        return [c for c in table.T if (np.diff(c) > 0).all()]
+
+    def side_by_side(a: Array, b: Array) -> bool:
+        step = min(np.diff(a).min(), np.diff(b).min())
+        return bool(np.abs(b - a - np.median(b - a)).max() < step / 2)
+
+    pairs = [(a, b) for a in columns(raw) for b in columns(truth)]
+    if pairs and not any(side_by_side(a, b) for a, b in pairs):
+        a, b = (
+            sorted({k[-1:] for k in keys} - {k[-1:] for k in others})
+            for keys, others in ((raw, truth), (truth, raw))
+        )
+        raise DataError(
+            f"{source}: expected raw arrays and ground truth of the same numbers, got ones that are not in step: raw has "
+            f"{_some(str(k[0]) for k in a)} alone, ground truth {_some(str(k[0]) for k in b)}",
+            hint="copy the missing files, or move away what has no partner",
+        )
 
 
 def _some(names: Any) -> str:

@@ -24,6 +24,9 @@ Float32 = NDArray[np.float32]
 HEADER_ROWS = 4  # at most so many rows of an image are metadata
 SATURATION = 4095.0  # counts, of a 12-bit sensor: taken unless it is said
 NEAREST, FARTHEST = 0.02, 30.0  # m, medians of depth images that a camera indoors can give
+FLAGS = (
+    8  # at most so many values beyond saturation are marks that a sensor writes; more are counts of more bits
+)
 _SUSPICIOUS = 0.25  # of saturation: no count beyond it is what a sensor of two bits less would give
 _REACH = (0.05, 5.0)  # m, depths that a table-top rig can see; the networks take others for holes
 # In 76 frames of simulated cameras and rooms, all in the right order: at most 0.11, at least 0.97, at least 0.86.
@@ -65,17 +68,32 @@ def check_unit(raw: NDArray[Any], info: TofInfo, path: object) -> str:
     """Refuse counts that this sensor cannot give; say what is suspicious, but a dark frame has low counts too."""
     largest, saturation = float(np.abs(raw[np.isfinite(raw)].astype(np.float64)).max()), info.saturation
     bits = math.ceil(math.log2(max(largest, 1) + 1))
-    if largest > saturation:
+    beyond = raw[np.abs(raw) > saturation] if largest > saturation else raw[:0]
+    if len(np.unique(beyond)) > FLAGS:
         raise DataError(
             f"{path}: expected counts of a sensor that saturates at {saturation:g}, got values up to {largest:g}",
-            hint=f"--saturation COUNTS says where yours does ({2**bits - 1} with {bits} bits)",
+            hint=_other_bytes(raw)
+            or f"--saturation COUNTS says where yours does ({2**bits - 1} with {bits} bits)",
         )
+    if beyond.size:
+        return ""
     if not 1 < largest <= _SUSPICIOUS * saturation:
         return ""
     return (
         f"{path}: no count exceeds {largest:g}. That is right for a dark scene of a sensor that saturates at {saturation:g}; "
         f"if yours has fewer bits, say so: --saturation {2**bits - 1} for {bits} bits"
     )
+
+
+def _other_bytes(raw: NDArray[Any]) -> str:
+    """Say that the bytes of words have changed places, where neighbours are alike only in the other order."""
+    if (
+        raw.dtype.kind not in "iu"
+        or raw.dtype.itemsize == 1
+        or roughness(raw.byteswap()) > 0.5 * roughness(raw)
+    ):
+        return ""
+    return "the bytes of each word have changed places: raw.byteswap(), or of plain words [raw] dtype = '>u2' in import.toml"
 
 
 def burst_mean(raw: NDArray[Any], info: TofInfo) -> NDArray[np.float64]:
@@ -117,6 +135,7 @@ def check_taps(
     if found or (apart and calibrated):
         found = apart
         hint = f"tofcapture calibrate phase-order {path} says what the channels are; reorder them"
+        hint = _other_bytes(np.rint(raw).astype(np.int64).astype(np.uint16)) or hint
         raise DataError(
             f"{where}: {found}; expected channels: {channels_in_words(info.modulation_hz, info.phase_rad)}",
             hint=f"{hint}; or take another --frame, or --average, if only this one is so" if which else hint,

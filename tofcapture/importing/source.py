@@ -27,6 +27,19 @@ from tofcapture.poses import Float64
 Role = Literal["", "raw", "truth", "pose", "other"]
 READERS = ("bags", "bop", "arrays", "images", "clouds")
 """Modules of :mod:`tofcapture.importing.readers`, asked in this order; the first that claims a path reads it."""
+_VIDEO = "a video loses what is measured: export frames as 16-bit PNG or .npy"
+UNREAD = {
+    ".jpg": "JPEG loses what is measured: export 16-bit PNG, TIFF or .npy",
+    ".exr": "np.save(name, cv2.imread(path, cv2.IMREAD_UNCHANGED)), with OPENCV_IO_ENABLE_OPENEXR=1",
+    ".csv": "np.save(name, np.loadtxt(path, delimiter=','))",
+    ".zip": "unpack it first",
+    ".avi": _VIDEO,
+    ".mkv": _VIDEO,
+    ".mp4": _VIDEO,
+    ".parquet": "tables of LeRobot and Hugging Face hold no raw frames: export images or .npy",
+}
+UNREAD |= {".jpeg": UNREAD[".jpg"], ".gz": UNREAD[".zip"], ".7z": UNREAD[".zip"], ".tar": UNREAD[".zip"]}
+"""What to do with files of measurements that no reader reads."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +54,7 @@ class Piece:
     facts: Facts = field(default_factory=Facts)  #: What the file knows of it.
     #: (4, 4) pose of the camera in the world, of a ``raw`` or ``pose``; (4, 4) to the ToF camera, of a ``truth``.
     T: Float64 | None = None
+    joints: Float64 | None = None  #: (6,) angles of the arm that held the camera.
 
 
 class Reader(Protocol):
@@ -66,23 +80,42 @@ def find_pieces(source: Path, said: Said) -> list[Piece]:
     if not source.exists():
         raise DataError(f"{source}: no such file or folder", hint="look at the path and its folder")
     readers = [cast("Reader", import_module(f"tofcapture.importing.readers.{name}")) for name in READERS]
-    found, passed = list[Piece](), list[str]()
+    found, passed, empty = list[Piece](), list[Path](), list[Path]()
     for path in _paths(source, readers):
         reader = next((r for r in readers if r.claims(path)), None)
         if reader is None:
-            passed.append(path.name)
+            passed.append(path)
             continue
         place = path.name if path == source else str(path.relative_to(source))
-        found += [
-            replace(p, name=f"{place}:{p.name}" if p.name else place) for p in reader.pieces(path, said)
-        ]
+        held = list(reader.pieces(path, said))
+        found += [replace(p, name=f"{place}:{p.name}" if p.name else place) for p in held]
+        empty += [] if held else [path]
     if not found:
         kinds = "arrays (.npy, .npz, .mat, .h5), 16-bit images (.png, .tif), raw words (.raw, .bin) or bags"
-        raise DataError(
-            f"{source}: expected {kinds}, found {', '.join(sorted(passed)[:5]) or 'an empty folder'}",
-            hint="save the arrays with np.save; see docs/howto/own-data.md",
+        seen = ", ".join(
+            [f"{p.name} without arrays of numbers" for p in empty] + sorted(p.name for p in passed)
         )
+        raise DataError(
+            f"{source}: expected {kinds}, found {seen[:200] or 'an empty folder'}",
+            hint=next((UNREAD[p.suffix.lower()] for p in passed if p.suffix.lower() in UNREAD), "")
+            or "save the arrays with np.save; see docs/howto/own-data.md",
+        )
+    if said.truth.get("kind") != "none":
+        _expect_read(passed, said, source)
     return sorted(found, key=lambda p: natural(p.name))
+
+
+def _expect_read(passed: list[Path], said: Said, source: Path) -> None:
+    """Refuse files of measurements that no reader reads: what is imported without them would look whole."""
+    poses = Path(str(said.poses.get("file", ""))).name
+    left = [p for p in passed if p.suffix.lower() in UNREAD and p.name != poses]
+    left = [p for p in left if re.search(r"depth|raw|truth|cloud|phase|taps|dcs", p.stem, re.IGNORECASE)]
+    if left:
+        raise DataError(
+            f"{source}: expected files that can be read, got {left[0].name}"
+            + (f" and {len(left) - 1} more" if len(left) > 1 else ""),
+            hint=f'{UNREAD[left[0].suffix.lower()]}; or move them away; or [truth] kind = "none" in import.toml',
+        )
 
 
 def _paths(source: Path, readers: list[Reader]) -> Iterator[Path]:

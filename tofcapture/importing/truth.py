@@ -14,6 +14,7 @@ from tofcapture.frames import NO_TRUTH
 from tofcapture.importing.plan import Planned
 from tofcapture.importing.rules import FARTHEST, NEAREST, Float32, metres
 from tofcapture.importing.said import Said
+from tofcapture.libraries import load_open3d
 from tofcapture.meshes import UNITS
 from tofcapture.poses import Float64, invert, transform_points
 
@@ -42,6 +43,8 @@ def point_map(view: Planned, said: Said, tof: Camera) -> PointMap:
         return PointMap(np.full((*tof.shape, 3), np.nan, np.float32), pinhole, np.eye(4), NO_TRUTH)
     where = view.pieces[-1].name
     values, kind = view.truth(), str(said.truth.get("kind", ""))
+    if view.pieces[-1].path.suffix.lower() == ".pcd" and values.ndim == 3 and not _is_map(values, view, said):
+        values = values[np.isfinite(values).all(axis=-1)]
     if values.shape[1:] in {(3,), (3, 3)} and len(values) > 3:
         return _of_surface(values, view, said, pinhole, where)
     if said.truth.get("axes") == "WH":
@@ -63,6 +66,17 @@ def point_map(view: Planned, said: Said, tof: Camera) -> PointMap:
         return _of_points(values, unit, missing, camera, T, where)
     depth = metres(values, unit, missing, where)
     return _of_depth(depth, kind == "radial", camera, T, tof, where)
+
+
+def _is_map(points: NDArray[Any], view: Planned, said: Said) -> bool:
+    """Whether points (H, W, 3) of a cloud are seen by a pinhole that stands where somebody says; others are a surface."""
+    if said.transform("T_tof_truth") is None and view.T_tof_truth is None:
+        return False
+    try:
+        pinhole_of(np.where((points == 0).all(axis=-1, keepdims=True), np.nan, points), "")
+    except DataError:
+        return False
+    return True
 
 
 def _of_depth(
@@ -177,8 +191,7 @@ def _of_surface(values: NDArray[Any], view: Planned, said: Said, pinhole: Camera
 
 def _cast(triangles: Float64, camera: Camera) -> Float32:
     """Cast the rays of a camera at triangles (M, 3, 3) in its frame: depth (H, W), NaN where none is hit."""
-    import open3d as o3d
-
+    o3d = load_open3d()
     scene = o3d.t.geometry.RaycastingScene()
     corners = np.ascontiguousarray(triangles.reshape(-1, 3), dtype=np.float32)
     numbers = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
@@ -214,11 +227,11 @@ def pinhole_of(points: NDArray[np.float32], where: str) -> Camera:
         fits += found.tolist()
     fx, cx, fy, cy = fits
     if off > _GRID or fx <= 0 or fy <= 0:
-        hint = (
-            "is x right, y down, z forward? else: is the map rectified? [truth.camera] names its intrinsics"
-        )
+        mirrored = [n for n, f in (("x", fx), ("y", fy)) if f < 0]
         raise DataError(
             f"{where}: expected points of a pinhole camera, got ones that miss the best by {off:.1f} px (fx {fx:.0f}, fy {fy:.0f})",
-            hint,
+            hint=f"{' and '.join(mirrored)} runs the other way: x is right, y down, z forward here; change its sign"
+            if mirrored and off < _GRID
+            else "is x right, y down, z forward? else: is the map rectified? [truth.camera] names its intrinsics",
         )
     return Camera(W, H, fx, fy, cx, cy)

@@ -63,7 +63,11 @@ def load_array(path: Path, name: str) -> NDArray[Any]:
     """Read one array of a file by its name."""
     array = arrays_of(path)[name]
     if array.dtype.kind not in "iufb":
-        raise DataError(f"{path}: {name or 'array'}: expected numbers, got {array.dtype}")
+        hint = "I and Q as two channels: np.stack([z.real, z.imag], 1), phase_deg = [0, 270], offset = false"
+        raise DataError(
+            f"{path}: {name or 'array'}: expected numbers, got {array.dtype}",
+            hint=hint if array.dtype.kind == "c" else "save each field as an array of its own: np.savez",
+        )
     return np.ascontiguousarray(array.astype(array.dtype.newbyteorder("="), copy=False))
 
 
@@ -81,7 +85,7 @@ def arrays_of(path: Path) -> dict[str, NDArray[Any]]:
             head = file.read(16)
         if suffix == ".mat" and not head.startswith((b"\x89HDF", b"MATLAB 7.3")):
             return _matlab(path)
-        return _hdf5(path, turned=suffix == ".mat")
+        return _hdf5(path)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError) as err:
         raise FormatError(
             f"{path}: cannot read the array of a {_KINDS[suffix]} file: {err}",
@@ -111,22 +115,47 @@ def _matlab(path: Path) -> dict[str, NDArray[Any]]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             found = loadmat(path)
-    except (MatReadError, NotImplementedError, TypeError) as err:
-        raise ValueError(err) from err
-    arrays = {k: v for k, v in found.items() if not k.startswith("__")}
-    return {k: v for k, v in arrays.items() if isinstance(v, np.ndarray) and v.dtype.kind in "iufb"}
+    except (MatReadError, NotImplementedError, TypeError, IndexError) as err:
+        raise ValueError(f"{err}: save it with -v7 or -v7.3") from err
+    return dict(_unpacked("", {k: v for k, v in found.items() if not k.startswith("__")}))
 
 
-def _hdf5(path: Path, *, turned: bool) -> dict[str, NDArray[Any]]:
-    """Read all datasets; MATLAB writes the axes of its arrays in reverse."""
+def _unpacked(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    """List the arrays in MATLAB's structs and cells: ``s/raw``, ``raw/0``."""
+    if isinstance(value, Mapping):
+        for key, below in value.items():
+            yield from _unpacked(f"{name}/{key}" if name else key, below)
+    elif not isinstance(value, np.ndarray):
+        return
+    elif value.dtype.names or value.dtype.kind == "O":
+        for i, one in enumerate(value.ravel()):
+            place = f"{name}/{i}" if value.size > 1 else name
+            named = {n: one[n] for n in value.dtype.names} if value.dtype.names else one
+            yield from _unpacked(place, named)
+    elif value.dtype.kind in "iufbc":
+        yield name, value
+
+
+def _hdf5(path: Path) -> dict[str, NDArray[Any]]:
+    """Read all datasets, and those of MATLAB's cells; MATLAB writes the axes of its arrays in reverse."""
     import h5py
 
     held: dict[str, NDArray[Any]] = {}
+    turned = False
 
     def keep(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and item.dtype.kind in "iufb" and not name.startswith("#refs#"):
+        nonlocal turned
+        turned |= "MATLAB_class" in item.attrs
+        if not isinstance(item, h5py.Dataset) or name.startswith("#refs#"):
+            return
+        if item.dtype.kind in "iufbc":
             held[name] = np.asarray(item[()])
+        elif h5py.check_ref_dtype(item.dtype) is h5py.Reference:  # a cell
+            for i, ref in enumerate(np.ravel(item[()], order="F")):
+                keep(f"{name}/{i}", file[ref])
 
+    with path.open("rb") as raw:
+        turned = raw.read(10) == b"MATLAB 7.3"
     with h5py.File(path, "r") as file:
         kind = file.attrs.get("format")
         if isinstance(kind, str) and kind.startswith("tofcapture-"):

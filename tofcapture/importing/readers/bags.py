@@ -1,7 +1,8 @@
 """Read bags of ROS 1 and 2, and MCAP, without ROS: frames of raw images with the ground truth and the pose of their moment.
 
 Frames are the messages of the topic that has fewest; every other topic gives its message nearest in time. Poses come from tf,
-interpolated. Which topics are raw and which are ground truth, their names say, or ``[raw] files`` and ``[truth] files``.
+PoseStamped or Odometry, interpolated; an arm's joints from JointState. Which topics are raw, ground truth and poses, their names
+say, or ``[raw] files``, ``[truth] files`` and ``[poses] file``.
 """
 
 from __future__ import annotations
@@ -21,10 +22,20 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, PassedOver
-from tofcapture.importing.readers.messages import camera_of, image_of, opened, stamp_of, transforms_of
+from tofcapture.importing.poses import pose_at
+from tofcapture.importing.readers.messages import (
+    POSES,
+    camera_of,
+    image_of,
+    joints_of,
+    opened,
+    pose_of,
+    stamp_of,
+    transforms_of,
+)  # fmt: skip
 from tofcapture.importing.said import Facts, Said
 from tofcapture.importing.source import Piece, natural
-from tofcapture.poses import Float64, exp, invert, log
+from tofcapture.poses import Float64, invert
 
 PICTURES = ("Image", "CompressedImage", "PointCloud2")
 TRUTH = frozenset(
@@ -49,6 +60,7 @@ OTHER = frozenset(
 )
 _LOST = 0.2  # of the frames that may lack a message of another topic; more is a damaged recording
 _FASTER = 5.0  # times, that stamps may run apart from the recording
+_SET_BACK = 1.0  # s that stamps may go back: messages overtake each other by less
 
 
 @dataclass
@@ -71,6 +83,8 @@ class _Bag:
     others: dict[str, str] = field(default_factory=dict)  # type by topic
     cameras: dict[str, Any] = field(default_factory=dict)  # CameraInfo by topic
     links: dict[str, tuple[str, list[tuple[int, Float64]]]] = field(default_factory=dict)  # by child
+    poses: dict[str, list[tuple[str, str, int, Float64]]] = field(default_factory=dict)  # by topic, as of tf
+    joints: list[tuple[int, Float64]] = field(default_factory=list)
 
 
 def claims(path: Path) -> bool:
@@ -98,12 +112,14 @@ def pieces(path: Path, said: Said) -> Iterator[Piece]:
     facts, T_tof_truth = Facts(camera=camera, axes="KHW"), None
     known = _truth_facts(bag, truth) if truth else Facts()
     frame = bag.topics[raw[0]].frame
+    _hang_poses(bag, frame, said)
     if truth and bag.topics[truth].frame:
         T_tof_truth = _between(bag, frame, bag.topics[truth].frame, rows[0][0], said)
     file = _file(path)
     for i, (time, held, target) in enumerate(rows):
         pose, load = _between(bag, "", frame, time, said), partial(_stacked, path, held, K, camera)
-        yield Piece(f"{raw[0]}/view{i:06d}", file, load, "raw", time, facts, pose)
+        joints = None if pose is None else _joints(bag, time, said)
+        yield Piece(f"{raw[0]}/view{i:06d}", file, load, "raw", time, facts, pose, joints)
         if truth and target is not None:
             load = partial(_message, path, truth, target)
             yield Piece(f"{truth}/view{i:06d}", file, load, "truth", time, known, T_tof_truth)
@@ -133,7 +149,14 @@ def _looked_through(path: Path, said: Said) -> _Bag:
                 bag.cameras.setdefault(topic, load())
             elif kind in {"TFMessage", "tfMessage"}:
                 for parent, child, stamp, T in transforms_of(load()):
-                    bag.links.setdefault(child, (parent, []))[1].append((stamp, T))
+                    known = bag.links.setdefault(child, (parent, []))[1]
+                    if topic.endswith("tf_static"):  # published again by every node that starts
+                        known.clear()
+                    known.append((stamp, T))
+            elif kind in POSES:
+                bag.poses.setdefault(topic, []).append(pose_of(load()))
+            elif kind == "JointState" and (row := joints_of(load())) is not None:
+                bag.joints.append(row)
     if not bag.topics:
         found = ", ".join(f"{t} ({k})" for t, k in bag.others.items()) or "no message at all"
         raise DataError(
@@ -141,6 +164,7 @@ def _looked_through(path: Path, said: Said) -> _Bag:
             hint="ros2 bag info, or mcap info, lists what was recorded",
         )
     for topic, held in bag.topics.items():
+        _in_order(held, f"{path}: {topic}")
         if (len(held.stamps) > 1 and len(set(held.stamps)) == 1) or not any(held.stamps):
             raise DataError(
                 f"{path}: {topic}: expected a stamp for every message, all are {held.stamps[0] / 1e9:g} s: its driver sets none",
@@ -154,7 +178,62 @@ def _looked_through(path: Path, said: Said) -> _Bag:
             )
     for _, poses in bag.links.values():
         poses.sort(key=lambda p: p[0])
+    bag.joints.sort(key=lambda j: j[0])
     return bag
+
+
+def _in_order(held: _Topic, where: str) -> None:
+    """Bring messages that overtook each other into the order of their stamps; :class:`DataError` when the clock went back."""
+    back = -min(np.diff(held.stamps), default=0) / 1e9
+    if back > _SET_BACK:
+        raise DataError(
+            f"{where}: expected stamps that ascend, they go back by {back:.3g} s",
+            hint='was a clock set while recording, or a bag played in a loop? [raw] stamps = "received" takes the times of recording',
+        )
+    if back > 0:
+        pairs = sorted(zip(held.stamps, held.received, strict=True))
+        held.stamps, held.received = map(list, zip(*pairs, strict=True))
+
+
+def _hang_poses(bag: _Bag, frame: str, said: Said) -> None:
+    """Put the poses of a topic into the tree of frames: the one that is said, else what moves the root that the camera hangs on."""
+    told, chain = str(said.poses.get("file", "")), _chain(bag, frame)
+    root = chain[-1]
+    topics = [told] if told in bag.poses else [t for t, rows in bag.poses.items() if rows[0][1] == root]
+    if told.startswith("/") and told not in bag.poses and not Path(told).exists():
+        found = ", ".join(bag.poses) or ", ".join(f"{t} ({k})" for t, k in bag.others.items())
+        raise DataError(
+            f"{bag.path}: expected PoseStamped or Odometry in [poses] file = {told!r}, got {found[:200]}",
+            hint="ros2 bag info lists the topics; without [poses] poses come from tf",
+        )
+    if not topics and root == frame:  # tf does not place the camera
+        topics = list(bag.poses)
+    elif not topics and bag.poses and all(len(bag.links[f][1]) == 1 for f in chain[:-1]):
+        text = (
+            f"{bag.path}: poses of {', '.join(bag.poses)} are not used: tf lets {frame} stand still on {root}"
+        )
+        warnings.warn(f"{text}; [poses] file takes them for the camera's", PassedOver, stacklevel=2)
+    if len(topics) > 1:
+        raise DataError(
+            f"{bag.path}: expected one topic of poses of the camera, got {', '.join(topics)}",
+            hint=f'[poses] file = "{topics[0]}" in import.toml',
+        )
+    for topic in topics:
+        parent, child = bag.poses[topic][0][:2]
+        if child not in {"", frame, root}:
+            text = f"{bag.path}: {topic} has the poses of {child}, tf does not say where {frame or 'the camera'} is on it: taken for the camera's"
+            warnings.warn(text, PassedOver, stacklevel=2)
+        hung = root if child == root else frame
+        rows = sorted(((stamp, T) for _, _, stamp, T in bag.poses[topic]), key=lambda p: p[0])
+        bag.links[hung] = (parent if parent not in {"", hung} else "world", rows)
+
+
+def _chain(bag: _Bag, frame: str) -> list[str]:
+    """Name a frame and all that it hangs on."""
+    chain = [frame]
+    while chain[-1] in bag.links and bag.links[chain[-1]][0] not in chain:
+        chain.append(bag.links[chain[-1]][0])
+    return chain
 
 
 def _words(topic: str) -> set[str]:
@@ -315,7 +394,7 @@ def _truth_facts(bag: _Bag, truth: str) -> Facts:
 
 def _between(bag: _Bag, outer: str, inner: str, time: int, said: Said) -> Float64 | None:
     """(4, 4) from frame ``inner`` to ``outer``, or to the root of its tree; ``None`` when tf does not say."""
-    time = time - round(float(said.poses.get("time_offset_s", 0.0)) * 1e9)
+    time -= _offset(said)
     if inner == outer:
         return np.eye(4)
     chains = [_to_root(bag, frame, time) for frame in (inner, outer) if frame]
@@ -341,15 +420,31 @@ def _to_root(bag: _Bag, frame: str, time: int) -> tuple[str, Float64]:
 
 def _at(poses: Sequence[tuple[int, Float64]], time: int, where: str) -> Float64:
     """Interpolate a pose; one alone stands still."""
-    if len(poses) == 1:
-        return poses[0][1]
     stamps = [s for s, _ in poses]
-    i = int(np.clip(np.searchsorted(stamps, time), 1, len(poses) - 1))
-    (s0, T0), (s1, T1) = poses[i - 1], poses[i]
-    if not stamps[0] - 2 * _half(stamps) <= time <= stamps[-1] + 2 * _half(stamps):
+    if len(poses) > 1 and not stamps[0] - 2 * _half(stamps) <= time <= stamps[-1] + 2 * _half(stamps):
         raise DataError(
             f"{where}: expected a pose at {time / 1e9:.3f} s, it goes from {stamps[0] / 1e9:.3f} to {stamps[-1] / 1e9:.3f} s",
             hint="clocks that differ: [poses] time_offset_s in import.toml",
         )
-    share = min(max((time - s0) / max(s1 - s0, 1), 0.0), 1.0)
-    return T0 @ exp(share * log(invert(T0) @ T1))
+    T = pose_at(stamps, [T for _, T in poses], time, np.inf)
+    if not np.isfinite(T).all():
+        raise DataError(
+            f"{where}: expected a pose at {time / 1e9:.3f} s, got NaN or a quaternion of length 0",
+            hint="the tracker had lost it there: cut the bag before, or record again",
+        )
+    return T
+
+
+def _joints(bag: _Bag, time: int, said: Said) -> Float64 | None:
+    """Interpolate the arm's joints (6,); ``None`` where the bag has none within a second."""
+    stamps = np.array([s for s, _ in bag.joints])
+    time -= _offset(said)
+    if not len(stamps) or np.abs(stamps - time).min() > 10**9:
+        return None
+    rows = np.stack([row for _, row in bag.joints])
+    return np.array([np.interp(time - stamps[0], stamps - stamps[0], row) for row in rows.T])
+
+
+def _offset(said: Said) -> int:
+    """Return what is added to the stamps of poses, nanoseconds."""
+    return round(float(said.poses.get("time_offset_s", 0.0)) * 1e9)

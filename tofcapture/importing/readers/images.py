@@ -16,7 +16,7 @@ from tofcapture.importing.rules import roughness
 from tofcapture.importing.said import Said
 from tofcapture.importing.source import Piece
 
-IMAGES = (".png", ".tif", ".tiff", ".pgm", ".bmp")
+IMAGES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".bmp")
 BINARY = (".raw", ".bin")
 
 

@@ -33,7 +33,17 @@ _NAMED = {
 }
 _FOXGLOVE = {
     "RawImage": "Image", "CompressedImage": "CompressedImage", "CameraCalibration": "CameraInfo", "FrameTransform": "TFMessage",
+    "PoseInFrame": "PoseStamped",
 }  # fmt: skip
+POSES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
+_FROM_BASE = (
+    "shoulder_pan",
+    "shoulder_lift",
+    "elbow",
+    "wrist_1",
+    "wrist_2",
+    "wrist_3",
+)  # ROS sorts them by name
 _DAMAGED = (
     "ros2 bag reindex, rosbag reindex or mcap recover mend what a killed recorder left; else copy it again"
 )
@@ -119,6 +129,9 @@ def _foxglove(data: bytes, kind: str) -> Any:
         link = SimpleNamespace(translation=move, rotation=turn)
         one = SimpleNamespace(header=header, child_frame_id=told["child_frame_id"], transform=link)
         return SimpleNamespace(transforms=[one])
+    if kind == "PoseStamped":
+        pose = SimpleNamespace(**{k: SimpleNamespace(**told["pose"][k]) for k in ("position", "orientation")})
+        return SimpleNamespace(header=header, pose=pose)
     rest = {k: v for k, v in told.items() if k not in {"timestamp", "frame_id", "data"}}
     values = np.frombuffer(base64.b64decode(told["data"]), np.uint8) if "data" in told else None
     return SimpleNamespace(header=header, data=values, is_bigendian=0, **rest)
@@ -230,10 +243,37 @@ def camera_of(message: Any, where: str, *, rectified: bool) -> Camera:
 
 
 def transforms_of(message: Any) -> Iterator[tuple[str, str, int, Float64]]:
-    """List parent, child, stamp and (4, 4) of a message of transforms."""
+    """List parent, child, stamp and (4, 4) of a message of transforms; NaN where it holds none."""
+    for one in message.transforms:
+        T = _rigid(one.transform.translation, one.transform.rotation)
+        yield one.header.frame_id.strip("/"), one.child_frame_id.strip("/"), stamp_of(one), T
+
+
+def pose_of(message: Any) -> tuple[str, str, int, Float64]:
+    """Return what :func:`transforms_of` does for a message of one pose; the child is empty where it does not say of what."""
+    if hasattr(message, "transform"):
+        T = _rigid(message.transform.translation, message.transform.rotation)
+    else:
+        pose = getattr(message.pose, "pose", message.pose)  # one with covariance
+        T = _rigid(pose.position, pose.orientation)
+    child = getattr(message, "child_frame_id", "")
+    return message.header.frame_id.strip("/"), child.strip("/"), stamp_of(message), T
+
+
+def _rigid(t: Any, q: Any) -> Float64:
     from scipy.spatial.transform import Rotation
 
-    for one in message.transforms:
-        q, t = one.transform.rotation, one.transform.translation
-        T = transform(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [t.x, t.y, t.z])
-        yield one.header.frame_id.strip("/"), one.child_frame_id.strip("/"), stamp_of(one), T
+    numbers = np.array([q.x, q.y, q.z, q.w, t.x, t.y, t.z])
+    if not np.isfinite(numbers).all() or not numbers[:4].any():
+        return np.full((4, 4), np.nan)
+    return transform(Rotation.from_quat(numbers[:4]).as_matrix(), numbers[4:])
+
+
+def joints_of(message: Any) -> tuple[int, Float64] | None:
+    """Return stamp and angles (6,) of an arm from the base on; ``None`` for a gripper, or an arm of other joints."""
+    arm = [i for i, n in enumerate(message.name) if not re.search("finger|gripper|hand", n)]
+    if len(arm) != 6 or len(message.position) != len(message.name):
+        return None
+    ranks = [next((r for r, w in enumerate(_FROM_BASE) if w in message.name[i]), 0) for i in arm]
+    arm = [i for _, _, i in sorted(zip(ranks, range(6), arm, strict=True))]
+    return stamp_of(message), np.array([float(message.position[i]) for i in arm])
