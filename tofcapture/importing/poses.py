@@ -89,7 +89,7 @@ def _of_json(held: Any) -> list[list[float]]:
     if isinstance(held, dict):
         frames = sorted(held["frames"], key=lambda f: str(f["file_path"]))
         held = [np.asarray(f["transform_matrix"], np.float64).reshape(4, 4) @ _OPENGL for f in frames]
-    return np.asarray(held, dtype=np.float64).reshape(-1, 16).tolist()  # type: ignore[no-any-return]
+    return np.asarray(held, dtype=np.float64).reshape(-1, 16).tolist()
 
 
 def _is_number(word: str) -> bool:

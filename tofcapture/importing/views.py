@@ -165,7 +165,7 @@ def _copied(view: View, name: str, seen: dict[str, str]) -> list[str]:
     """Name frames that are, bit for bit, frames of before: noise alone makes two of one scene differ."""
     for i, frame in enumerate(view.tof.raw):
         mine = f"view {view.index}, frame {i}"
-        other = seen.setdefault(hashlib.sha256(np.ascontiguousarray(frame)).hexdigest(), mine)
+        other = seen.setdefault(hashlib.sha256(frame.tobytes()).hexdigest(), mine)
         if other != mine:
             text = f"{name}: {mine} is {other}, bit for bit"
             return [f"{text}: did the driver stand still, or is it a copy? leave it out"]

@@ -42,7 +42,7 @@ def read_surface(path: Path) -> NDArray[Any]:
         if len(mesh.triangles):
             corners: NDArray[Any] = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
             return corners
-    points = np.asarray(o3d.io.read_point_cloud(path).points)
+    points: NDArray[Any] = np.asarray(o3d.io.read_point_cloud(path).points)
     if not len(points) or not np.isfinite(points).any():
         raise FormatError(
             f"{path}: expected points or triangles, found none", hint="copy it again, or leave it out"
