@@ -52,4 +52,5 @@ def read_surface(path: Path) -> NDArray[Any]:
     rows = int(next(iter(re.findall(rb"^HEIGHT\s+(\d+)", head, re.MULTILINE)), 1))
     if rows > 1 and len(points) % rows == 0:
         return points.reshape(rows, -1, 3)
-    return points[np.isfinite(points).all(axis=1)]
+    finite: NDArray[Any] = points[np.isfinite(points).all(axis=1)]
+    return finite
