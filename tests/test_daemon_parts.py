@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import json
 import os
 import re
 import signal
@@ -313,3 +314,22 @@ def test_the_token_reaches_no_log(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     _announce(tmp_path / "sock", "http://127.0.0.1:1/#token=secret")
     assert "secret" in capsys.readouterr().err
+
+
+def test_a_folder_that_goes_while_the_recorder_starts_is_noticed(tmp_path):
+    """Between the daemon's look and the recorder's first file lie seconds of loading: it looks again, and writes nothing."""
+    root = tmp_path / "root"
+    root.mkdir()
+    job = {
+        "scene": "mug", "recording": str(root / "r"), "views": 1, "frames": 2, "retake": None, "seed": None,
+        "station": None, "allow_motion": False, "previews": str(tmp_path), "folders": {str(root): root.stat().st_ino},
+    }  # fmt: skip
+    root.rename(tmp_path / "away")
+    root.mkdir()
+    run = subprocess.run(
+        [sys.executable, "-m", "tofcapture.record.daemon.worker"],
+        input=json.dumps(job) + "\n", capture_output=True, text=True, timeout=PATIENCE, check=False,
+    )  # fmt: skip
+    last = json.loads(run.stdout.splitlines()[-1])
+    assert (last["kind"], last["cause"], last["own"]) == ("error", "FolderGone", False), run.stderr
+    assert list(root.iterdir()) == []

@@ -21,12 +21,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DiskFull",
+    "FolderGone",
     "HeldFolders",
     "check_motion_allowed",
     "check_space",
     "full_disk_named",
     "hold_arm",
     "hold_file",
+    "inode_of",
 ]
 
 _VIEW_BYTES = 40e6  # a view of a full-size rig with truth, and room to spare
@@ -85,6 +87,12 @@ def identity_of(folder: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return (found.st_dev, found.st_ino) if folder.is_dir() else None
+
+
+def inode_of(folder: Path) -> int | None:
+    """Inode of a folder, ``None`` where there is none; a device's number may change when a machine starts."""
+    known = identity_of(folder)
+    return known and known[1]
 
 
 def holder(path: Path) -> int | None:

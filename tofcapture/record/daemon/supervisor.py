@@ -13,7 +13,6 @@ import traceback
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any, Self
 
 from tofcapture import __version__
@@ -22,7 +21,7 @@ from tofcapture.files.view import check_scene_name
 from tofcapture.record.daemon.settings import Settings
 from tofcapture.record.daemon.store import WISH, Event, Job, Store
 from tofcapture.record.journal import utc_now
-from tofcapture.record.resources import identity_of
+from tofcapture.record.resources import inode_of
 
 GRACE = 3.0  # s from the order to stop until a recorder is killed
 _SILENT = 3.0  # s without a sign of life until health says so
@@ -162,12 +161,6 @@ class Progress:
         return {"job": self.job, "views": [self.views[i] for i in sorted(self.views)]}
 
 
-def _inode_of(folder: Path) -> int | None:
-    """Inode of a folder, ``None`` where there is none; a device's number may change when a machine starts."""
-    known = identity_of(folder)
-    return known and known[1]
-
-
 class Supervisor:
     """Works on the queue until closed; what was running when the last daemon died waits, paused, for a person."""
 
@@ -183,7 +176,7 @@ class Supervisor:
             store.folders()
         )  # inodes of the root and of the recordings that were begun
         if "" not in self._held:
-            self._hold({"": _inode_of(settings.root)})
+            self._hold({"": inode_of(settings.root)})
         self._gone = self._look_again = (
             False  # the queue rests for a folder that went; a person has looked since
         )
@@ -314,7 +307,7 @@ class Supervisor:
         """Say why a job must not be begun: the root, or its recording, is not the folder that it was, also before a restart."""
         root, again, self._look_again = self.settings.root, self._look_again, False
         held = {name: self._held[name] for name in ("", job.recording) if name in self._held}
-        now = await asyncio.to_thread(lambda: {name: _inode_of(root / name) for name in held})
+        now = await asyncio.to_thread(lambda: {name: inode_of(root / name) for name in held})
         if again and None not in now.values():
             self._hold(now)  # a person was told, has looked, and both are there
         elif changed := [name for name in held if now[name] != held[name]]:
@@ -394,6 +387,12 @@ class Supervisor:
             "station": str(settings.station) if settings.station else None,
             "allow_motion": settings.allow_motion,
             "previews": str(settings.state.previews),
+            # a folder may go while the recorder starts: it looks again, right before it writes
+            "folders": {
+                str(settings.root / name): self._held[name]
+                for name in ("", job.recording)
+                if name in self._held
+            },
         }
         self._recorder = await RecorderProcess.start(told, settings)
         if self.reason:
@@ -419,7 +418,7 @@ class Supervisor:
         kind = message.pop("kind")
         self.counters[kind] += 1
         if kind == "planned":
-            self._hold({recording: _inode_of(self.settings.root / recording)})
+            self._hold({recording: inode_of(self.settings.root / recording)})
         if kind == "sealed":
             message["preview"] = self.counters["sealed"]
         self._say(kind, job=self.progress.job, progress=self.progress.counts(), **message)

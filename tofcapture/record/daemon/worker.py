@@ -29,7 +29,7 @@ from tofcapture.ops.phase import Decoder
 from tofcapture.record.daemon.settings import PICTURES
 from tofcapture.record.journal import JobRefused
 from tofcapture.record.observer import Observer, Stopped
-from tofcapture.record.resources import check_motion_allowed
+from tofcapture.record.resources import FolderGone, check_motion_allowed, inode_of
 from tofcapture.record.stopping import stoppable
 
 if TYPE_CHECKING:
@@ -228,6 +228,12 @@ def _work(job: Mapping[str, Any], link: DaemonLink) -> dict[str, Any]:
             link.tell("log", text=f"caution: {caution}")
         link.tell("opened", station=station.describe(), simulated=station.simulated)
         staffed = replace(station, operator=PageOperator(link)) if station.operator.person else station
+        for folder, inode in job["folders"].items():
+            if inode_of(Path(folder)) != inode:
+                raise FolderGone(
+                    f"{folder} is not the folder that it was: moved, deleted or unmounted",
+                    hint="put it back or mount it, then go on",
+                )
         wish = {key: job[key] for key in ("scene", "recording", "views", "frames", "retake")}
         result = record(staffed, observer=link, **wish)
     return {"failed": list(result.failed), "reasons": list(result.reasons)}
