@@ -115,6 +115,28 @@ def test_links_lead_somewhere():
                 assert (page.parent / target).exists(), f"{page.relative_to(ROOT)}: {target}"
 
 
+def _sentences(text):
+    """Words of each sentence, its number of words; code, tables, headings and pictures are no sentences."""
+    text = re.sub(r"```.*?```|<!--.*?-->", "\n\n", text, flags=re.DOTALL)
+    lines = ["" if re.match(r"\s*[|#!]|    \S", line) else line for line in text.splitlines()]
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", "\n".join(lines))
+    for paragraph in re.split(r"\n\s*\n|\n\s*(?:[-*]|\d+\.)\s", text):
+        for sentence in re.split(r"(?<=[.?!:;])\*{0,2}\s+", paragraph):
+            yield sum(bool(re.search(r"\w", word)) for word in sentence.split()), sentence
+
+
+def test_pages_are_short_and_plain():
+    """20,000 words in all, README 600, a decision 400; a sentence 25, a cell of a table 12."""
+    texts = {p: p.read_text() for p in (*PAGES, ROOT / "README.md")}
+    assert sum(len(text.split()) for text in texts.values()) <= 20_000
+    assert len(texts[ROOT / "README.md"].split()) <= 600
+    for page, text in texts.items():
+        assert page.parent.name != "decisions" or len(text.split()) <= 400, page
+        assert [said for words, said in _sentences(text) if words > 25] == [], page
+        cells = [cell for line in text.splitlines() if line.startswith("|") for cell in line.split("|")]
+        assert [cell for cell in cells if len(cell.split()) > 12] == [], page
+
+
 def test_extras_are_documented_and_complete():
     """Each extra stands in the table of sizes, and ``all`` leads to every one of them that it is not said of."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]

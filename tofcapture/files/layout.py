@@ -6,6 +6,7 @@ Writers create what is listed here, readers fetch it, :mod:`tofcapture.files.che
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntFlag
@@ -188,10 +189,14 @@ def _table(header: str, rows: list[str]) -> str:
     return "\n".join([header, "|---" * (header.count("|") - 1) + "|", *rows, ""])
 
 
+_AS_ABOVE = re.compile("^arm/after|_4x$")  # the page says of these that they are as others
+
+
 def _section(layout: Layout) -> str:
     fields = [
         f"| `/{f.path}`{'?' * f.optional} | {' or '.join(f.dtypes)} | ({', '.join(f.dims)}) | {f.units} | {f.doc} |"
         for f in layout
+        if not _AS_ABOVE.search(f.path)
     ]
     shared = set(_rows(_DESCRIPTIONS))
     own = [f"`{name}` ({doc})" for name, kind, doc in layout.attrs[2:] if (name, kind, doc) not in shared]
