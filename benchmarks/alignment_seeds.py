@@ -27,6 +27,7 @@ from calibration.alignment.methods import alignment_error
 from calibration.alignment.views import joint_view_of
 from calibration.registration.clouds import WORKING_DEPTH, Cloud, tof_depth
 from calibration.registration.gate import register
+from calibration.registration.pairs import sighting_of
 from tofcapture.devices.sim import stereo as stereos
 from tofcapture.devices.sim.config import Constants, read_constants
 from tofcapture.devices.sim.light import Light
@@ -162,7 +163,7 @@ def run_seed(pool: int, seed: int, cache: Path) -> list[dict[str, Any]]:
         for i, pose in enumerate(poses_of(pool, seed))
     ]
     start, true = world.nominal_rig().T_tof_stereo, world.true_rig.T_tof_stereo
-    reduced = [joint_view_of(view) for view in views]
+    reduced = [joint_view_of(view, sighting_of(view)) for view in views]
     averaged, weighted = plain(views, [view.surface for view in reduced], start)
     rows = [_row("plain averaged", averaged, true), _row("plain weighted", weighted, true)]
     joint = joint_icp(reduced, start)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -9,12 +10,14 @@ from typing import Any, Literal
 from calibration.alignment.diagnosis import check_start, explained
 from calibration.alignment.methods import apply_method, method_named
 from calibration.alignment.rounds import Progress, RefusedPairsError, demand_pairs, find_start, solve
+from calibration.alignment.views import JointView, joint_view_of
 from calibration.evidence import evidence_of, write_json
-from calibration.registration.gate import backend_named
-from calibration.registration.pairs import Pair, calibration_views, load_pair
+from calibration.registration.gate import backend_named, check_clouds
+from calibration.registration.pairs import Pair, calibration_views, pair_of, sighting_of
 from tofcapture.errors import DataError
 from tofcapture.files.disk import check_writable
 from tofcapture.files.seal import write_text
+from tofcapture.files.view import open_view
 from tofcapture.libraries import called
 from tofcapture.pool import Pool
 from tofcapture.poses import invert
@@ -71,7 +74,7 @@ def align(
     recording = Path(recording)
     out = recording if out is None else Path(out)
     check_writable(out, "name a folder that can be written: --out")
-    pairs = _load(recording, progress)
+    pairs, views = _load(recording, progress, joint=method == "joint")
     start = initial if isinstance(initial, Rig) else pairs[0].rig
     if initial == "none":
         with Pool(1, pinned=True) as pool:
@@ -81,26 +84,34 @@ def align(
         solution = solve(pairs, backend, start.T_tof_stereo, progress)
     except RefusedPairsError as err:
         raise explained(err, recording, pairs, backend, start.T_tof_stereo) from None
-    rig, found = apply_method(method, recording, pairs, solution, start)
+    rig, found = apply_method(method, pairs, views, solution, start)
     evidence = evidence_of(pairs, solution, backend, start.T_tof_stereo, rig.T_tof_stereo, found)
     write_json(out / "evidence.json", evidence)
     write_text(out / "rig.toml", dumps_rig(rig))
     return rig, evidence
 
 
-def _load(recording: Path, progress: Progress) -> list[Pair]:
+def _load(recording: Path, progress: Progress, *, joint: bool) -> tuple[list[Pair], list[JointView | None]]:
+    """Read every view once: its pair, and where asked for what the joint method takes of it, None without clouds."""
     paths = calibration_views(recording)
     demand_pairs(len(paths), [None] * len(paths))
-    pairs = []
+    pairs: list[Pair] = []
+    views: list[JointView | None] = []
     for i, path in enumerate(paths):
         progress("reading", i, len(paths))
-        pairs.append(load_pair(recording, path))
+        view = open_view(path)
+        seen = sighting_of(view)
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        pairs.append(pair_of(view, seen, path.relative_to(recording).as_posix(), digest))
+        blind = check_clouds(pairs[-1].source, pairs[-1].target) is not None
+        views.append(joint_view_of(view, seen) if joint and not blind else None)
         if (pairs[-1].rig.tof, pairs[-1].rig.stereo) != (pairs[0].rig.tof, pairs[0].rig.stereo):
             raise DataError(
                 f"{pairs[-1].name}: taken with other cameras than {pairs[0].name}",
                 hint="use one recording per rig",
             )
-    return pairs
+    return pairs, views
 
 
 called(__name__, "calibration.align:align")

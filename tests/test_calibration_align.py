@@ -30,7 +30,7 @@ from calibration.registration.gate import (
     measure_registration,
     residuals,
 )
-from calibration.registration.pairs import Pair, pair_of
+from calibration.registration.pairs import Pair, pair_of, sighting_of
 from calibration.registration.rims import rim_cloud, stereo_rims, tof_rims
 from tests import answers
 from tofcapture import poses
@@ -324,7 +324,8 @@ def test_view_that_saw_nothing_is_an_empty_pair():
     view = simulated_view(0, frames=2)
     dark = replace(view.tof, raw=np.zeros_like(view.tof.raw))
     blind = replace(view.stereo, points=np.full_like(view.stereo.points, np.nan))
-    pair = pair_of(replace(view, tof=dark, stereo=blind), "view-000", "")
+    view = replace(view, tof=dark, stereo=blind)
+    pair = pair_of(view, sighting_of(view), "view-000", "")
     result = measure_registration(np.eye(4), pair.source, pair.target)
     assert (len(pair.source), len(pair.target)) == (0, 0)
     assert check_registration(result, pair.source, pair.target, np.eye(4)) is Refusal.EMPTY

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,10 @@ import numpy as np
 from calibration.alignment.averages import about, fuse, twist_about
 from calibration.alignment.joint import JointSolution, joint_icp
 from calibration.alignment.rounds import Solution
-from calibration.alignment.views import TERMS, joint_view_of
+from calibration.alignment.views import TERMS, JointView
 from calibration.range_error.terms import Terms, jackknife
 from calibration.registration.pairs import Pair
 from tofcapture.errors import ConfigError
-from tofcapture.files.view import open_view
 from tofcapture.poses import Float64, invert, rotation_angle, transform_points
 from tofcapture.rig import RangeError, Rig, range_error_table
 
@@ -44,12 +42,12 @@ def method_named(name: str) -> str:
 
 
 def apply_method(
-    method: str, recording: Path, pairs: Sequence[Pair], solution: Solution, start: Rig
+    method: str, pairs: Sequence[Pair], views: Sequence[JointView | None], solution: Solution, start: Rig
 ) -> tuple[Rig, dict[str, Any]]:
     """Turn gated registrations into a rig.
 
-    The joint method reads the accepted views again from the recording. The rig is the start rig with the new ``T_tof_stereo``; the
-    joint method adds its range errors. Beside it comes what ``evidence.json`` gains.
+    ``views`` are what the joint method takes of the pairs. The rig is the start rig with the new ``T_tof_stereo``; the joint method
+    adds its range errors. Beside it comes what ``evidence.json`` gains.
     """
     averaged, weighted = invert(solution.average.T), _weighted(solution, solution.used)
     found, rig = {"averaged": averaged, "weighted": weighted}, start
@@ -57,11 +55,11 @@ def apply_method(
     if method == "weighted":
         extra = _uncertainty(*_left_out(solution, weighted))
     if method == "joint":
-        views = [joint_view_of(open_view(recording / pairs[i].name)) for i in solution.used]
-        joint = joint_icp(views, averaged)
+        used = [view for i in solution.used if (view := views[i])]
+        joint = joint_icp(used, averaged)
         found["joint"] = joint.T_tof_stereo
-        hz = views[0].modulation_hz
-        rig = replace(start, range_errors=composed(views[0].factory, hz, joint.range_coefficients))
+        hz = used[0].modulation_hz
+        rig = replace(start, range_errors=composed(used[0].factory, hz, joint.range_coefficients))
         extra = joint_evidence(joint, hz)
     methods = {name: _stated(T, pairs[0].truth) for name, T in found.items()}
     rig = replace(rig, T_tof_stereo=found[method])

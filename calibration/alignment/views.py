@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,8 @@ from calibration.registration.clouds import (
     Cloud,
     dilate,
     range_sigma,
-    stereo_cloud,
-    surface_points,
-    tof_depth,
 )
+from calibration.registration.pairs import Sighting
 from calibration.registration.rims import ACROSS, Rims, lit_rims, square_rims, unveiled_rims
 from tofcapture.camera import Camera
 from tofcapture.channels import SPEED_OF_LIGHT
@@ -74,13 +73,12 @@ class JointView:
         return out
 
 
-def joint_view_of(view: View) -> JointView:
+def joint_view_of(view: View, seen: Sighting) -> JointView:
     """Reduce a view."""
-    info = view.tof.info
-    phasor, depth = tof_depth(view.tof)
+    info, phasor = view.tof.info, seen.phasor
     celsius = float(np.mean(view.tof.celsius))
     _, signals = phase.Decoder(info).signals(view.tof.raw.mean(axis=0, dtype=np.float64), celsius)
-    board = _pixels_of(surface_points(view.tof, depth), info.camera)
+    board = _pixels_of(seen.surface, info.camera)
     pixels = board[::STRIDE]
     hz = phase.frequencies(info.modulation_hz)
     rays = (info.camera.rays / info.camera.ray_lengths[..., None]).reshape(-1, 3)
@@ -88,8 +86,7 @@ def joint_view_of(view: View) -> JointView:
     # Of the board alone: a dark pixel elsewhere has no amplitude to divide by.
     lit = np.abs(phasor).reshape(len(hz), -1)[:, pixels]
     sigma = [high_sigma * hz[-1] / f * lit[-1] / a for f, a in zip(hz, lit, strict=True)]
-    surface = stereo_cloud(view.stereo)
-    stereo = unveiled_rims(view.stereo.points, view.stereo.info.camera)
+    stereo = unveiled_rims(seen.rims, view.stereo.points, view.stereo.info.camera)
     return JointView(
         illuminator=info.illuminator,
         modulation_hz=hz,
@@ -98,10 +95,10 @@ def joint_view_of(view: View) -> JointView:
         ranges=signals.ranges.reshape(len(hz), -1)[:, pixels].astype(np.float64),
         sigma=np.stack(sigma),
         halos=halo_errors(phasor, hz).reshape(len(hz), -1, len(HALO_RADII))[:, pixels],
-        rims=_beside(lit_rims(phasor, depth, info.camera, info.illuminator), board, info.camera),
+        rims=_beside(lit_rims(phasor, seen.depth, info.camera, info.illuminator), board, info.camera),
         factory=info.range_errors,
-        surface=surface,
-        held=square_rims(stereo, surface, view.rig.T_stereo_tof[:3, 3]),
+        surface=seen.cloud,
+        held=square_rims(stereo, seen.cloud, view.rig.T_stereo_tof[:3, 3]),
     )
 
 
@@ -113,18 +110,33 @@ def halo_errors(phasor: NDArray[np.complex128], modulation_hz: tuple[float, ...]
 
     The answer is (F, H, W, len(HALO_RADII)), metres.
     """
-    from scipy.signal import fftconvolve
+    from scipy.fft import fft2, ifft2
 
     H, W = phasor.shape[-2:]
-    v, u = np.mgrid[-H + 1 : H, -W + 1 : W]
+    halos = _halo_spectra(H, W)
     out = np.zeros((*phasor.shape, len(HALO_RADII)))
-    for i, radius in enumerate(HALO_RADII):
+    for j, hz in enumerate(modulation_hz):
+        spectrum = fft2(phasor[j], halos[0].shape)
+        toward = phasor[j].conj() / np.maximum(np.square(np.abs(phasor[j])), 1e-9)
+        for i, halo in enumerate(halos):
+            spread = ifft2(spectrum * halo)[:H, :W]
+            out[j, :, :, i] = SPEED_OF_LIGHT / (4 * np.pi * hz) * (toward * spread).imag
+    return out
+
+
+@lru_cache(maxsize=1)
+def _halo_spectra(H: int, W: int) -> list[NDArray[np.complex128]]:
+    """Spectra of the halos of unit sum about the first pixel, on a grid where an image (H, W) does not wrap."""
+    from scipy.fft import fft2, next_fast_len
+
+    shape = next_fast_len(2 * H - 1), next_fast_len(2 * W - 1)
+    out = []
+    for radius in HALO_RADII:
+        v, u = np.mgrid[-H + 1 : H, -W + 1 : W]
         halo = (1 + (np.hypot(u, v) / (radius * W)) ** 2) ** -1.5
-        halo /= halo.sum()
-        for j, hz in enumerate(modulation_hz):
-            spread = fftconvolve(phasor[j], halo)[H - 1 : 2 * H - 1, W - 1 : 2 * W - 1]
-            power = np.maximum(np.square(np.abs(phasor[j])), 1e-9)
-            out[j, :, :, i] = SPEED_OF_LIGHT / (4 * np.pi * hz) * (phasor[j].conj() * spread).imag / power
+        about = np.zeros(shape)
+        about[v, u] = halo / halo.sum()
+        out.append(np.asarray(fft2(about)))
     return out
 
 

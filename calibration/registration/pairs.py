@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.registration.clouds import Cloud, stereo_cloud, surface_points, tof_depth
-from calibration.registration.rims import REPEAT, rim_cloud, stereo_rims, tof_rims
+from calibration.registration.rims import REPEAT, Rims, rim_cloud, stereo_rims, tof_rims
 from tofcapture.errors import DataError
 from tofcapture.files.disk import what_is
-from tofcapture.files.view import find_views, open_view
+from tofcapture.files.view import find_views
 from tofcapture.frames import View
 from tofcapture.poses import Float64
 from tofcapture.rig import Rig
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Hold what both cameras of a view saw; every method of alignment starts from it."""
+
+    #: (F, H, W) and (H, W) of the ToF burst, as of :func:`tof_depth`
+    phasor: NDArray[np.complex128]
+    depth: Float64
+    surface: Float64  #: (N, 3) trusted ToF points, ToF frame, metres
+    rims: Rims  #: Stereo rims, stereo frame
+    cloud: Cloud  #: Dense cloud of the stereo camera, stereo frame
 
 
 @dataclass(frozen=True)
@@ -47,26 +59,24 @@ def calibration_views(recording: Path) -> list[Path]:
     return found
 
 
-def pair_of(view: View, name: str, sha256: str) -> Pair:
+def sighting_of(view: View) -> Sighting:
+    """Decode a view and find its surfaces and stereo rims."""
+    phasor, depth = tof_depth(view.tof)
+    points = surface_points(view.tof, depth)
+    return Sighting(phasor, depth, points, stereo_rims(view.stereo.points), stereo_cloud(view.stereo))
+
+
+def pair_of(view: View, seen: Sighting, name: str, sha256: str) -> Pair:
     """Reduce a view to its pair of clouds."""
     info = view.tof.info
-    phasor, depth = tof_depth(view.tof)
-    rims = np.repeat(tof_rims(phasor, depth, info.camera).points, REPEAT, axis=0)
-    held = rim_cloud(stereo_rims(view.stereo.points), view.rig.T_stereo_tof[:3, 3])
+    rims = np.repeat(tof_rims(seen.phasor, seen.depth, info.camera).points, REPEAT, axis=0)
+    held = rim_cloud(seen.rims, view.rig.T_stereo_tof[:3, 3])
     return Pair(
         name=name,
         sha256=sha256,
-        source=np.concatenate([rims, surface_points(view.tof, depth)]),
-        target=held + stereo_cloud(view.stereo),
+        source=np.concatenate([rims, seen.surface]),
+        target=held + seen.cloud,
         rig=view.rig,
         modulation_hz=max(info.modulation_hz),
         truth=None if view.truth is None else view.truth.T_tof_stereo,
     )
-
-
-def load_pair(recording: Path, path: Path) -> Pair:
-    """Read a view file and reduce it; :class:`DataError` names a file that is unreadable or damaged."""
-    view = open_view(path)
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return pair_of(view, path.relative_to(recording).as_posix(), digest)

@@ -94,9 +94,8 @@ def stereo_rims(points: NDArray[np.floating]) -> Rims:
     return _joined(found)
 
 
-def unveiled_rims(points: NDArray[np.floating], camera: Camera) -> Rims:
-    """Find rims in a stereo point map (H, W, 3), stereo frame, that no wrong match beside them can have moved."""
-    rims = stereo_rims(points)
+def unveiled_rims(rims: Rims, points: NDArray[np.floating], camera: Camera) -> Rims:
+    """Keep rims of a stereo point map (H, W, 3), stereo frame, that no wrong match beside them can have moved."""
     step = np.rint(rims.outward[:, :2]).astype(np.intp)
     u = camera.fx * rims.points[:, 0] / rims.points[:, 2] + camera.cx - step[:, 0] / 2
     v = camera.fy * rims.points[:, 1] / rims.points[:, 2] + camera.cy - step[:, 1] / 2

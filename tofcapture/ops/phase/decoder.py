@@ -18,7 +18,7 @@ from tofcapture.channels import TapNoise, frequencies, wrap_table
 from tofcapture.errors import DataError
 from tofcapture.frames import TofFlag, TofInfo
 from tofcapture.ops.phase import float32
-from tofcapture.ops.phase.float32 import Correction, Float32
+from tofcapture.ops.phase.float32 import Float32, correction
 from tofcapture.ops.phase.noise import NoiseLine, NoiseMeter, median_of_chi_squared, middle, stuck_lines
 from tofcapture.ops.phase.phasors import information
 from tofcapture.ops.phase.reference import UNKNOWN_CELSIUS
@@ -93,7 +93,7 @@ class Decoder:
         rows = float32.tap_rows(info)
         self._rows, self._spare = float32.sparse(rows.weights), rows.spare
         by_hz = {e.modulation_hz: e for e in info.range_errors}
-        self._corrections = [Correction(by_hz.get(f, RangeError(f)), info.camera) for f in hz]
+        self._corrections = [correction(by_hz.get(f, RangeError(f)), info.camera) for f in hz]
         known = information(info)
         self.wraps = wrap_table(hz, known, info.reach)
         unit = np.square(2 * np.pi / self.wraps.U)

@@ -7,6 +7,7 @@ machine.
 from __future__ import annotations
 
 from copy import copy
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -124,6 +125,12 @@ def _sine(turns: Any) -> Any:
     t = -_HALF - t if t < np.float32(-0.25) else t
     x = t * t
     return t * (_S0 + x * (_S1 + x * (_S2 + x * _S3)))
+
+
+@lru_cache(maxsize=8)
+def correction(error: RangeError, camera: Camera) -> Correction:
+    """Return the table of a range error for a camera, made once: it takes longer than decoding a burst."""
+    return Correction(error, camera)
 
 
 class Correction:
