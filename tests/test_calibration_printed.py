@@ -11,11 +11,12 @@ import pytest
 from calibration.board.fit import Sight
 from calibration.board.geometry import load_board
 from calibration.board.printed import corners_in, read_corners
-from calibration.board.seen import must_be_unique, seen_in_image
+from calibration.board.seen import must_be_unique, seen_by_stereo, seen_in_image
 from tests.commands import calibrate
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, QualityError
-from tofcapture.poses import invert, rotation_angle, rotation_exp, transform
+from tofcapture.frames import StereoFrame, StereoInfo
+from tofcapture.poses import exp, invert, rotation_angle, rotation_exp, transform
 
 BOARDS = ("chessboard", "charuco", "aprilgrid")
 LENS = Camera(320, 256, 280.0, 282.0, 161.0, 125.0, (-0.12, 0.05, 0.001, -0.0007, 0.0))
@@ -78,6 +79,39 @@ def test_large_images_of_tags_hold_no_stray_corner(roll):
     )
     assert len(at) > 0.7 * len(board.pattern.corners)
     assert np.abs(pixels - true).max() < 0.2
+
+
+def plate_before_a_wall(board, camera, T, noise=0.0002):
+    """Stereo frame of a plate at ``T_camera_board`` before a larger one 6 cm behind, and a wall."""
+    rays = camera.rays.astype(np.float64)
+    points = rays * 1.5
+    for behind, aside, larger in ((0.06, (0.05, -0.05), 1.4), (0.0, (0.0, 0.0), 1.0)):
+        top = T[:3, 3] + (board.thickness - behind) * T[:3, 2]
+        hit = rays * ((top @ T[:3, 2]) / (rays @ T[:3, 2]))[..., None]
+        on = np.abs((hit - T[:3, 3]) @ T[:3, :2] - aside) < larger * board.outline.max(axis=0)
+        points = np.where(on.all(axis=-1)[..., None], hit, points)
+    depth = points[..., 2:] + np.random.default_rng(0).normal(0, noise, (camera.height, camera.width, 1))
+    return StereoFrame((rays * depth).astype(np.float32), 0, StereoInfo("made", "1", camera))
+
+
+def test_a_plate_is_held_by_all_of_its_outline():
+    """A start that is off comes home; from one that is hopeless the fit comes home or is refused, and does not slide."""
+    board, camera = load_board("chessboard"), Camera(640, 512, 560.0, 560.0, 319.5, 255.5)
+    T = pose(board, 20, 30, 8, 0.75)
+    frame = plate_before_a_wall(board, camera, T)
+    for move in (
+        [0.015, 0.01, 0, 0, 0, 0.01],
+        [-0.015, 0.012, 0.004, 0.01, 0, -0.02],
+        [0.07, 0.06, 0, 0, 0, 0],
+        [0.14, 0.1, 0, 0, 0, 0],
+    ):
+        try:
+            fit = seen_by_stereo(frame, board, T @ exp(move))
+        except QualityError:
+            assert abs(move[0]) > 0.05
+            continue
+        assert np.linalg.norm(fit.T[:3, 3] - T[:3, 3]) < 0.0012
+        assert rotation_angle(invert(T) @ fit.T) < np.radians(0.1)
 
 
 def test_patterns_are_opencvs():

@@ -267,22 +267,33 @@ def _explained(model: Model, sight: Sight, fit: Fit, camera: Camera) -> Detectio
 
 
 def _holes(board: Board, T: Float64, rims: Float64, camera: Camera) -> dict[str, float]:
-    """Share of the samples of each hole's edge, in the image and with the front as silhouette, that a rim (N, 2) lies beside."""
+    """Share of each hole's edge in sight that a rim (N, 2) lies beside."""
+    shares = {
+        hole.name: share_found(board, T, *sampled(hole.corners, SAMPLES), rims, camera)
+        for hole in board.holes
+    }
+    return {name: share for name, share in shares.items() if np.isfinite(share)}
+
+
+def share_found(
+    board: Board, T: Float64, at: Float64, inward: Float64, rims: Float64, camera: Camera
+) -> float:
+    """Share of an edge's samples (N, 2), in the image and with the front as silhouette, that a rim (M, 2) lies beside.
+
+    ``inward`` (N, 2) points into the material. NaN where too few samples are in sight.
+    """
     from scipy.spatial import cKDTree
 
-    tree, out = cKDTree(rims), {}
-    for hole in board.holes:
-        at, right = sampled(hole.corners, SAMPLES)
-        pixel, depth = camera.project(
-            transform_points(T, np.column_stack([at, np.full(len(at), board.thickness)]))
-        )
-        with np.errstate(invalid="ignore"):
-            in_image = (pixel > MARGIN) & (pixel < np.array([camera.width, camera.height]) - 1 - MARGIN)
-        seen = at[clear_of_walls(T, board, at, -right) & in_image.all(axis=1) & (depth > 0)]
-        if len(seen) >= MIN_SAMPLES:
-            gap, _ = tree.query(seen)
-            out[hole.name] = float((gap < 2 * ON_EDGE).mean())
-    return out
+    pixel, depth = camera.project(
+        transform_points(T, np.column_stack([at, np.full(len(at), board.thickness)]))
+    )
+    with np.errstate(invalid="ignore"):
+        in_image = (pixel > MARGIN) & (pixel < np.array([camera.width, camera.height]) - 1 - MARGIN)
+    seen = at[clear_of_walls(T, board, at, -inward) & in_image.all(axis=1) & (depth > 0)]
+    if len(seen) < MIN_SAMPLES:
+        return float("nan")
+    gap, _ = cKDTree(rims).query(seen)
+    return float((gap < 2 * ON_EDGE).mean())
 
 
 def _check(model: Model, sight: Sight, found: Detection) -> None:

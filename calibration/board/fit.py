@@ -153,6 +153,7 @@ class Sight:
     bias_sigma: float  #: What a common range error may be, metres
     at: Float64 | None = None  #: (N, 2) where on the board the rims are known to be: corners of a pattern
     edge_sigma: float = RIM_SIGMA  #: Of a rim or corner on the board, metres
+    common_sigma: float = COMMON  #: What all rims or corners may be off sideways by together, metres
 
 
 @dataclass(frozen=True)
@@ -181,7 +182,7 @@ def refine(model: Model, sight: Sight, T: Float64, scales: Sequence[float] = SCA
         step = -np.linalg.solve(weighted @ J + prior + 1e-6 * np.eye(UNKNOWNS), g)
         T, nuisance = exp(step[:6]) @ T, nuisance + step[6:]
     equations = _equations(model, sight, T, nuisance, scales[-1])
-    return Fit(T, float(nuisance[0]), _covariance(*equations, prior, T))
+    return Fit(T, float(nuisance[0]), _covariance(*equations, prior, T, sight.common_sigma))
 
 
 def _equations(
@@ -222,7 +223,7 @@ def _equations(
 
 
 def _covariance(
-    J: Float64, r: Float64, w: Float64, cluster: NDArray[np.intp], prior: Float64, T: Float64
+    J: Float64, r: Float64, w: Float64, cluster: NDArray[np.intp], prior: Float64, T: Float64, common: float
 ) -> Float64:
     """Covariance at the board's origin: what the weights promise, plus what the clusters show, plus what all rims share.
 
@@ -237,5 +238,5 @@ def _covariance(
     C = (bread + bread @ meat @ bread)[:6, :6]
     move = np.eye(6)
     move[:3, 3:] = -hat(T[:3, 3])
-    out: Float64 = move @ C @ move.T + np.diag([COMMON**2] * 3 + [0.0] * 3)
+    out: Float64 = move @ C @ move.T + np.diag([common**2] * 3 + [0.0] * 3)
     return out

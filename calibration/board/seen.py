@@ -11,23 +11,27 @@ from numpy.typing import NDArray
 from calibration.board.detector import (
     MIN_RIMS,
     NEAR_PLANE,
+    SAMPLES,
     BoardRefusal,
     detect,
     refused,
+    share_found,
     stereo_sight,
     tof_sight,
 )
 from calibration.board.fit import SCALES, Fit, Model, Sight, on_front, refine
-from calibration.board.geometry import Board
+from calibration.board.geometry import Board, sampled
 from calibration.board.printed import corners_in, printed_pose
 from calibration.registration.clouds import MAX_SIGMA, range_sigma, tof_depth
 from tofcapture.camera import Camera
 from tofcapture.errors import QualityError
 from tofcapture.frames import StereoFrame, TofBurst
-from tofcapture.poses import Float64
+from tofcapture.poses import Float64, transform
 
 CORNER_SIGMA = 0.1  # px, of a corner, to begin with: the corners' own scatter follows
-LEAST_SIGMA = 0.02  # px
+LEAST_SIGMA = 0.02  # px; also what all corners of an image may be off by together
+OUTLINE = 0.7  # least share of the outline in sight that has rims beside it
+NUDGES = ((0.0, 0.0), (0.02, 0.0), (-0.02, 0.0), (0.0, 0.02), (0.0, -0.02))  # m on the board, of other starts
 TURNED = "half a turn looks the same: take an odd and an even number of squares, or a ChArUco board"
 
 
@@ -71,7 +75,8 @@ def seen_in_image(image: NDArray[Any], board: Board, camera: Camera, beside: Sig
     )
     fit = refine(Model(board), sight, T)
     left = float(np.median(np.abs(on_front(fit.T, board, sight.rims) - at)))
-    sight = replace(sight, edge_sigma=max(1.4826 * left, LEAST_SIGMA / CORNER_SIGMA * sight.edge_sigma))
+    least = LEAST_SIGMA / CORNER_SIGMA * sight.edge_sigma
+    sight = replace(sight, edge_sigma=max(1.4826 * left, least), common_sigma=least)
     return Seen(refine(Model(board), sight, fit.T, SCALES[-1:]), pixels, at)
 
 
@@ -99,13 +104,27 @@ def seen_by_stereo(frame: StereoFrame, board: Board, start: Float64 | None) -> F
         return detect(sight, board, frame.info.camera).fit
     if start is None:
         raise refused(BoardRefusal.NO_HOLES, board, "the other camera does not say where it is")
+    share = 0.0
+    for x, y in NUDGES:  # a side that lies beside a rim of another thing may hold a fit there
+        share, fit = _by_outline(sight, board, start @ transform(np.eye(3), [x, y, 0.0]), frame.info.camera)
+        if share >= OUTLINE:
+            return fit
+    detail = f"{100 * share:.0f} % of its outline in sight has rims beside it"
+    raise refused(BoardRefusal.WRONG_BOARD, board, detail)
+
+
+def _by_outline(sight: Sight, board: Board, start: Float64, camera: Camera) -> tuple[float, Fit]:
+    """Fit a plate from a start (4, 4); before the fit the share of the outline in sight that is found."""
+    model = Model(replace(board, holes=()))
     for near in (2 * NEAR_PLANE, NEAR_PLANE / 2):
         own = _about(sight, board, start, near)
         if len(own.rims) < MIN_RIMS:
             raise refused(BoardRefusal.NO_PLANE, board, f"{len(own.rims)} rims about its outline")
-        fit = refine(Model(replace(board, holes=())), own, start)
+        fit = refine(model, own, start)
         start = fit.T
-    return fit
+    at, right = sampled(board.outline, SAMPLES)
+    share = share_found(board, fit.T, at, -right, on_front(fit.T, board, own.rims), camera)
+    return share if np.isfinite(share) else 0.0, fit
 
 
 def must_be_unique(board: Board) -> None:
