@@ -224,8 +224,8 @@ def _use_journal(path):
     with closing(Journal(path.parent)) as journal:
         journal.agree({"frames": 2, "station": {"a": [1]}})
         journal.rows()
-        journal.expect("mug", dict.fromkeys(range(9), "pose"))
-        journal.seal("mug", 8, "e" * 64)
+        journal.expect("mug", dict.fromkeys(range(9), ("pose",)))
+        journal.seal("mug", 8, "e" * 64, "pose")
     check(path.parent)
 
 

@@ -37,7 +37,7 @@ def test_every_view_and_every_reason_is_drawn(drawn, tmp_path):
     views = [g for g in root.iter(f"{SVG}g") if g.get("class") == "view"]
     titles = sorted(g.find(f"{SVG}title").text for g in views)
     said = [
-        f"view {v.index}: {v.distance:.2f} m, object turned by {np.degrees(v.turn):.0f} deg"
+        f"view {v.index}: {v.distance:.2f} m, object turned by {np.degrees(v.turn):.0f} deg, {v.coverage:.0%} of it covered"
         for v in plan.views
     ]
     assert titles == sorted(2 * said)

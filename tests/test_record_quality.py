@@ -14,7 +14,11 @@ from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.files.view import open_view, view_path
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo
 from tofcapture.poses import invert, look_at, rotation_exp, transform, transform_points
+from tofcapture.record import plan as plans
+from tofcapture.record import recorder
+from tofcapture.record.plan import object_sampling, plan_scene
 from tofcapture.record.quality import (
+    ELSEWHERE,
     LIMITS,
     NOTE,
     REFUSE,
@@ -26,6 +30,7 @@ from tofcapture.record.quality import (
     meter,
     quality_table,
 )
+from tofcapture.record.sight import covered
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError, Rig
 
 __all__ = ["_few_candidates"]  # applies here too
@@ -71,7 +76,7 @@ def test_a_good_view_passes():
     """Nothing is said about a good view, and every check has a number."""
     numbers = measure(**_good())
     assert broken_limits(numbers) == []
-    assert set(numbers) == {check.name for check in LIMITS} | {"offset_m"}
+    assert set(numbers) == {check.name for check in LIMITS} - {"object_coverage"} | {"offset_m"}
     assert quality_table(numbers)["notes"] == []
 
 
@@ -222,7 +227,7 @@ def test_refusals_come_first_and_speak():
     failed = broken_limits(numbers)
     assert len(failed) == len(LIMITS)
     order = [check.action for check in failed]
-    assert order == sorted(order, key=(REFUSE, RETAKE, NOTE).index)
+    assert order == sorted(order, key=(REFUSE, RETAKE, ELSEWHERE, NOTE).index)
     assert all(check.sentence(numbers) and check.hint for check in failed)
 
 
@@ -347,7 +352,58 @@ def test_a_burst_of_one_frame():
     one = replace(tof, raw=tof.raw[:1], time_ns=tof.time_ns[:1], celsius=tof.celsius[:1])
     numbers = measure(**{**parts, "tof": one, "frames": 1})
     assert broken_limits(numbers) == []
-    assert set(numbers) == {check.name for check in LIMITS} - {"flicker"} | {"offset_m"}
+    assert set(numbers) == {check.name for check in LIMITS} - {"flicker", "object_coverage"} | {"offset_m"}
+
+
+# What a view shows of its object, and another place for it.
+def test_what_is_covered_of_an_object():
+    """A block on the table, seen from straight above: all but its rim, half of that, and nothing is told of no block and of no table."""
+    T = look_at([0.0, 0.0, 0.66], np.zeros(3))
+    depth = np.full(TOF.shape, 0.66)
+    depth[12:24, 16:32] = 0.5
+    points = TOF.unproject(depth)
+    points = points.reshape(-1, 3)
+    shares = [covered(depth, p, TOF, T) for p in (points, points[points[:, 0] > 0])]
+    assert shares == pytest.approx([10 * 14 / (12 * 16), 10 * 6 / (12 * 16)])
+    bare = np.full(TOF.shape, 0.66)
+    assert np.isnan(covered(bare, TOF.unproject(bare).reshape(-1, 3), TOF, T))
+    assert np.isnan(covered(depth, points[:0], TOF, T))
+
+
+@pytest.mark.parametrize(
+    ("first", "other", "kept"),
+    [(0.6, 0.9, "first"), (0.3, 0.7, "other"), (0.3, 0.2, "first"), (0.3, None, "first")],
+)
+def test_a_view_that_shows_too_little_is_taken_from_elsewhere(tmp_path, monkeypatch, first, other, kept):
+    """Once, and the better one is kept, with its pose in file and journal; what fails elsewhere costs nothing; a rerun keeps it all."""
+    few = replace(object_sampling(), directions=40, distances=(0.5, 0.6))
+    monkeypatch.setattr(plans, "object_sampling", lambda: few)
+    bench = Bench()
+    station = bench.station()
+    (planned,) = plan_scene(station, "mug", 1).views
+    assert planned.spare is not None
+
+    def look(*_):
+        at_first = np.allclose(bench.joints, planned.joints)
+        if not at_first and other is None:
+            raise DeviceError("the lamp broke")
+        return {"object_coverage": first if at_first else other}
+
+    monkeypatch.setattr(recorder, "measure", look)
+    bench.station = lambda: station
+    result = _record(tmp_path, bench, views=1)
+    assert (result.recorded, result.failed) == ((0,), ())
+    view = open_view(view_path(tmp_path, "mug", 0))
+    pose = (planned if kept == "first" else planned.spare).digest
+    (row,) = rows(tmp_path)
+    assert row.pose == view.provenance["pose"] == pose
+    words = [note["words"] for note in view.provenance["quality"]["notes"]]
+    assert result.notes == tuple(f"view 0: {w}" for w in words)
+    assert len(words) == (first < 0.55)
+    assert ("70%" in row.reason) == (kept == "other")
+    if other is None:
+        assert "the lamp broke" in words[0]
+    assert _record(tmp_path, bench, views=1).kept == (0,)
 
 
 # What the board views cover so far, from the arm's poses alone.

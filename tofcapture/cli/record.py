@@ -170,8 +170,9 @@ def _plan_table(plan: Plan) -> str:
         tilt, side = math.degrees(math.acos(min(1.0, z))), math.degrees(math.atan2(y, x))
         joints = " ".join(f"{math.degrees(q):+7.1f}" for q in v.joints)
         angles = f"{math.degrees(v.turn):.0f}", f"{v.distance:.3f} m", f"{tilt:.0f}", f"{side:+.0f}"
-        rows.append([v.index, *angles, joints])
-    return table(["view", "turn", "distance", "tilt", "from", "joints (deg)"], rows)
+        seen = "-" if math.isnan(v.coverage) else f"{v.coverage:.0%}"
+        rows.append([v.index, *angles, seen, joints])
+    return table(["view", "turn", "distance", "tilt", "from", "covered", "joints (deg)"], rows)
 
 
 def _recorded(recording: Path, result: RecordResult) -> Outcome:

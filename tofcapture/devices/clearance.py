@@ -22,10 +22,10 @@ from tofcapture.rig import Rig
 
 _BRACKET = 0.04  # m; radius of what holds a camera
 _TABLE_MARGIN = 0.04  # m; air above the table, beyond the radii
-_COLUMN = 0.20  # m; the flange and the rig keep this far from the base's axis
+COLUMN = 0.20  # m; the flange and the rig keep this far from the base's axis
 _STEP = np.radians(3.0)  # largest joint step between checks on a path
 _MOST = np.radians(149.0)  # largest turn of a joint in one motion: a change of the kinematic branch is larger
-_FREE = 3  # pieces of the arm next to each other that cannot meet, or are joined
+WRIST = 3  # last pieces of the arm, on which the rig is mounted; as many next to each other cannot meet
 
 _SHAPES = {
     "target": (3,), "board": (3,), "board_normal": (3,), "home": (6,), "tof_box": (2, 3), "stereo_box": (2, 3),
@@ -141,7 +141,7 @@ def obstacles(
     # The shoulder stands on the base, as high above the table as the base stands.
     out[:, 0] = (moving[:, 1:, :, 2].min(axis=2) < workcell.table + thick[1:] + _TABLE_MARGIN).any(axis=1)
     out[:, 1] = _in_cylinder(moving, thick, workcell).any(axis=1)
-    out[:, 2] = (np.linalg.norm(body.cameras[..., :2], axis=-1) < _COLUMN + air).any(axis=1)
+    out[:, 2] = (np.linalg.norm(body.cameras[..., :2], axis=-1) < COLUMN + air).any(axis=1)
     rest = np.flatnonzero(~out.any(axis=1))
     out[rest, 3] = _meets_itself(body.arm[rest], body.rig[rest], body.radii, air)
     return out.reshape(*np.shape(joints)[:-1], len(REASONS))
@@ -167,12 +167,12 @@ def _meets_itself(
     arm: Float64, held: Float64, radii: tuple[Float64, Float64], air: float
 ) -> NDArray[np.bool_]:
     """Tell where pieces (N, S, 2, 3) of the arm come near others that are not their neighbours, or the rig near the arm."""
-    wrist = arm.shape[1] - _FREE  # the first of the last pieces, on which the rig is mounted
+    wrist = arm.shape[1] - WRIST  # the first of the last pieces, on which the rig is mounted
     real = np.flatnonzero(
         np.linalg.norm(np.diff(arm[:1], axis=2), axis=-1).max(initial=0.0, axis=(0, 2)) > 1e-6
     )
     # The flange comes to the forearm only as the rig does that it carries.
-    pairs = [(i, j) for i in real for j in real if j >= i + _FREE and (i < 2 or j >= wrist) and i < wrist - 1]
+    pairs = [(i, j) for i in real for j in real if j >= i + WRIST and (i < 2 or j >= wrist) and i < wrist - 1]
     out = np.zeros(len(arm), dtype=bool)
     for i, j in pairs:
         out |= segment_gap(arm[:, i], arm[:, j]) < radii[0][i] + radii[0][j] + air

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -117,21 +117,21 @@ class Journal:
                     hint="go on with the same station and options, or record into another folder",
                 )
 
-    def expect(self, scene: str, poses: Mapping[int, str]) -> set[int]:
-        """Note planned views (index -> digest of the pose) and say which of them are there already.
+    def expect(self, scene: str, poses: Mapping[int, Sequence[str]]) -> set[int]:
+        """Note planned views (index -> digests of the pose and of others that do as well) and say which are there already.
 
         Raises :class:`JobRefused`: a view of that number was recorded at another pose.
         """
         sealed = {row.index: row.pose for row in self.rows(scene) if row.state == "sealed"}
         for index in sorted(sealed.keys() & poses.keys()):
-            if sealed[index] != poses[index]:
+            if sealed[index] not in poses[index]:
                 raise JobRefused(
-                    f"view {index} of {scene!r} was recorded at pose {sealed[index]}, the plan wants {poses[index]}",
+                    f"view {index} of {scene!r} was recorded at pose {sealed[index]}, the plan wants {poses[index][0]}",
                     hint="use the same --seed and --station as before, or record into another folder",
                 )
         now = utc_now()
         self._db.do("BEGIN")
-        for index, pose in poses.items():
+        for index, (pose, *_) in poses.items():
             self._db.do(_PLAN, (scene, index, pose, now, now))
         self._db.do("COMMIT")
         return sealed.keys() & poses.keys()
@@ -144,9 +144,10 @@ class Journal:
         """Count one more attempt, before anything moves."""
         self._set(scene, index, "attempts = attempts + 1")
 
-    def seal(self, scene: str, index: int, sha256: str) -> None:
-        """Note that a view is on disk under its name."""
-        self._set(scene, index, "state = 'sealed', reason = '', step = '', sha256 = ?", sha256)
+    def seal(self, scene: str, index: int, sha256: str, pose: str, reason: str = "") -> None:
+        """Note that a view of a pose is on disk under its name, and why of another pose than planned."""
+        change = "state = 'sealed', step = '', sha256 = ?, pose = ?, reason = ?"
+        self._set(scene, index, change, sha256, pose, reason)
 
     def fail(self, scene: str, index: int, reason: str) -> None:
         """Note that a view was given up."""

@@ -1,8 +1,9 @@
-"""Which views to take of a scene: spread over directions and distances, reachable, clear of everything.
+"""Which views to take of a scene: spread over directions and distances, reachable, clear of everything, seen by both cameras.
 
 A UR arm reaches far fewer views than one expects. The plan tries thousands of candidates and keeps those that are clear, at
-the goal and on the straight way from home. It picks from them by greedy farthest-point sampling over direction and
-distance: 10 views are the first 10 of 25, so a recording can be extended. A person may turn the object between views.
+the goal and on the straight way from home, and from which both cameras see enough of an object (``record.sight``). It picks
+from them by greedy farthest-point sampling over direction and distance: 10 views are the first 10 of 25, so a recording can
+be extended. With a view comes another place, for an object of which it shows too little. A person may turn the object.
 
 Each view is held as its way from home and back allows: by the clearance model with room to spare, and by the checks of the arm
 itself. So the way by home is always there, and :func:`prove` shows it before anything moves.
@@ -24,7 +25,8 @@ from tofcapture.devices.station import Station
 from tofcapture.errors import ConfigError, MotionRefused
 from tofcapture.files.view import check_scene_name
 from tofcapture.frames import CALIBRATION
-from tofcapture.poses import Float64, invert, look_at, rotate_vectors
+from tofcapture.poses import Float64, invert, look_at, rotate_vectors, rotation_exp, transform
+from tofcapture.record import sight
 from tofcapture.rig import Rig
 
 Bools = NDArray[np.bool_]
@@ -45,6 +47,10 @@ REMEDIES = {
         "where each way to hold the arm meets something",
         "make room: table, keep-out and base together",
     ),
+    "sight": (
+        "where both cameras together see too little of an object",
+        "aim them at one point, 0.5 m away; see stereo_box and target of [plan]",
+    ),
     "way from home": (
         "not to be reached from home in a straight way that the arm's own checks allow",
         "choose another home ([plan] home); see workspace, keep_out and max_step_deg of [arm]",
@@ -56,6 +62,9 @@ JOINT_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.25])  # in "close to home"
 _LOG_DISTANCE = 0.6  # rad per e-fold of distance: how much a nearer view counts against a turned one
 _FEW = 24  # candidates that each pick of the sampling chooses among
 _MOST_TURNS = 36
+_PLENTY = 10 * _FEW  # candidates from which on a view's other place is none of the views to come
+_WORTH = 0.85  # of what the best candidates show of an object: less is no view
+_ALIKE = 0.03  # of an object; rolls that show as much are chosen among by their nearness to home
 # m; more room than the checks before a motion ask for: an arm arrives within 0.02 deg, not exactly
 _AIR = 0.005
 
@@ -70,6 +79,12 @@ class PlannedView:
     distance: float  # from the ToF camera to the target; NaN, as the next, where a person chooses the place
     direction: Float64  # (3,) unit, from the target to the camera, base frame
     turn: float = 0.0  # of the object about the vertical, counter-clockwise seen from above
+    coverage: float = float(
+        "nan"
+    )  # share of an object that is expected to have good ground truth; NaN: nobody asked
+    spare: PlannedView | None = (
+        None  # the same view from elsewhere, should the object be seen too little of here
+    )
 
     @property
     def digest(self) -> str:
@@ -79,13 +94,20 @@ class PlannedView:
             numbers = np.array([self.index, self.turn])  # the place is whoever's choice
         return hashlib.sha256((np.round(numbers, 6) + 0.0).tobytes()).hexdigest()[:16]
 
+    @property
+    def places(self) -> list[str]:
+        """Digests of the poses that it may be recorded at, the planned one first."""
+        return [self.digest, *(self.spare.places if self.spare else ())]
+
     def as_json(self) -> dict[str, Any]:
         """Write the view as JSON types."""
         turned = {"index": self.index, "turn_deg": round(float(np.degrees(self.turn)), 6)}
         if np.isnan(self.joints).all():
             return turned
         place = {"distance": self.distance, "direction": self.direction.tolist()}
-        return {**turned, "joints": self.joints.tolist(), **place}
+        seen = {"coverage": round(self.coverage, 3)} if np.isfinite(self.coverage) else {}
+        spare = {"spare": self.spare.as_json()} if self.spare else {}
+        return {**turned, "joints": self.joints.tolist(), **place, **seen, **spare}
 
 
 @dataclass(frozen=True)
@@ -115,7 +137,9 @@ class Plan:
     def summary(self) -> str:
         """Say in one line how many views there are, and what stood against the other candidates."""
         refused = ", ".join(f"{count} {reason}" for reason, count in self.refused.items() if count)
-        return f"{len(self.views)} of {self.wanted} views; {self.candidates} candidates, refused: {refused or 'none'}"
+        shares = [view.coverage for view in self.views if np.isfinite(view.coverage)]
+        seen = f" that show {min(shares):.0%} to {max(shares):.0%} of an object" if shares else ""
+        return f"{len(self.views)} of {self.wanted} views{seen}; {self.candidates} candidates, refused: {refused or 'none'}"
 
     def shortfall(self) -> list[str]:
         """Say why there are fewer views than wanted, the commonest reason first; nothing when there are enough."""
@@ -214,8 +238,8 @@ def plan_views(
     apart; views of one turn follow each other. ``check`` is the arm's own of a motion; see ``Arm.check_move``.
     """
     directions, distances = candidates(sampling, rng)
-    T_base_flange = flange_poses(rig, target, sampling, directions, distances, rng)
-    holds, refusal = hold_poses(model, rig, workcell, T_base_flange)
+    T_base_flange = flange_poses(rig, workcell, target, sampling, directions, distances, rng)
+    holds, refusal, shares = hold_poses(model, rig, workcell, T_base_flange, both=sampling.both)
     count = len(refusal)
     angles = 2 * np.pi * np.arange(turns) / turns
     seen = np.concatenate([rotate_vectors(_about_vertical(-angle), directions) for angle in angles])
@@ -223,21 +247,31 @@ def plan_views(
     if sampling.lean:
         lean = sampling.lean * leans(rig, sampling.axis, T_base_flange[:, 0])
         features = np.column_stack([features, np.tile(lean, (turns, 1))])
-    joints: dict[int, Float64 | None] = {}
+    held: dict[int, tuple[Float64, float] | None] = {}
 
     def accept(k: int) -> bool:
         c = k % count
-        if c not in joints:
-            joints[c] = next((q for q in holds(c) if _from_home(model, rig, workcell, q, check)), None)
-            if joints[c] is None:
+        if c not in held:
+            held[c] = next((h for h in holds(c) if _from_home(model, rig, workcell, h[0], check)), None)
+            if held[c] is None:
                 refusal[c] = REFUSALS.index("way from home")
-        return joints[c] is not None
+        return held[c] is not None
 
-    chosen = _spread(features, np.tile(refusal < 0, turns), views, accept, rng)
+    def view(i: int, k: int, spare: PlannedView | None = None) -> PlannedView:
+        c, angle = k % count, float(angles[k // count])
+        hold = held[c]
+        assert hold is not None
+        q, share = hold
+        place = float(distances[c]), directions[c], angle
+        return PlannedView(i, q, forward(model, q), *place, share, spare)
+
+    most = np.tile(shares, turns) if sampling.both else None
+    chosen = _spread(features, np.tile(refusal < 0, turns), views, accept, rng, most)
+    # The other place belongs to the same turn of the object.
+    spares = [None if other is None else k - k % count + other % count for k, other in chosen]
     planned = [
-        PlannedView(i, q, forward(model, q), float(distances[c]), directions[c], angle)
-        for i, c, angle in ((i, k % count, float(angles[k // count])) for i, k in enumerate(chosen))
-        if (q := joints[c]) is not None
+        view(i, k, None if spare is None else view(i, spare))
+        for i, ((k, _), spare) in enumerate(zip(chosen, spares, strict=True))
     ]
     refused = {reason: int((refusal == i).sum()) for i, reason in enumerate(REFUSALS)}
     tried = Tried(target + distances[:, None] * directions, refusal)
@@ -268,11 +302,12 @@ class Sampling:
     directions: int = 400
     rolls: int = 4  # the one nearest to home is kept
     lean: float = 0.0  # how much it counts that the axis leans in another direction of the image
+    both: bool = False  # aim both cameras, and keep the views that show enough of an object to both
 
 
 def object_sampling() -> Sampling:
     """Sample all around the vertical, 0.35 to 1.5 m away."""
-    return Sampling(axis=np.array([0.0, 0.0, 1.0]))
+    return Sampling(axis=np.array([0.0, 0.0, 1.0]), both=True)
 
 
 def board_sampling(workcell: Workcell) -> Sampling:
@@ -300,14 +335,20 @@ def candidates(sampling: Sampling, rng: np.random.Generator) -> tuple[Float64, F
 
 def flange_poses(
     rig: Rig,
+    workcell: Workcell,
     target: Float64,
     sampling: Sampling,
     directions: Float64,
     distances: Float64,
     rng: np.random.Generator,
 ) -> Float64:
-    """Find flange poses (C, rolls, 4, 4) from which the ToF camera looks at the target."""
+    """Find flange poses (C, rolls, 4, 4) from which the ToF camera looks at the target, or the line between both cameras.
+
+    From afar they look at the foot of what stands there: from aside, the table in the image's middle lies behind it.
+    """
     spots = target + rng.uniform(-sampling.aim, sampling.aim, directions.shape)
+    if sampling.both:
+        spots[:, 2] -= (target[2] - workcell.table) * (1 - distances.min() / distances)
     rolls = 2 * np.pi * (np.arange(sampling.rolls) / sampling.rolls)
     rolls = rolls + rng.uniform(0, 2 * np.pi, (len(spots), 1))
     cameras = np.stack(
@@ -316,7 +357,21 @@ def flange_poses(
     c, s = np.cos(rolls), np.sin(rolls)
     turns = np.broadcast_to(np.eye(4), (*rolls.shape, 4, 4)).copy()
     turns[..., 0, 0], turns[..., 0, 1], turns[..., 1, 0], turns[..., 1, 1] = c, -s, s, c
-    return cameras[:, None] @ turns @ invert(rig.T_flange_tof)
+    aimed = cameras[:, None] @ turns
+    if sampling.both:
+        aimed = aimed @ np.stack([_between(rig, workcell, distance) for distance in distances])[:, None]
+    return aimed @ invert(rig.T_flange_tof)
+
+
+def _between(rig: Rig, workcell: Workcell, distance: float) -> Float64:
+    """(4, 4) turn of the ToF camera by which what lay on its axis comes to lie between it and the stereo camera's."""
+    baseline = 2 * float(workcell.stereo_box[:, 0].mean())
+    other = (rig.T_tof_stereo @ [baseline / 2, 0.0, distance, 1.0])[:3]
+    middle = (other / max(other[2], 1e-6) * distance + [0.0, 0.0, distance]) / 2
+    axis = np.array([middle[1], -middle[0], 0.0])  # middle x z
+    sine = float(np.linalg.norm(axis))
+    angle = np.arctan2(sine, middle[2])
+    return transform(rotation_exp(axis / max(sine, 1e-12) * angle), np.zeros(3))
 
 
 def leans(rig: Rig, axis: Float64, T_base_flange: Float64) -> Float64:
@@ -328,35 +383,49 @@ def leans(rig: Rig, axis: Float64, T_base_flange: Float64) -> Float64:
 
 
 def hold_poses(
-    model: ArmModel, rig: Rig, workcell: Workcell, T_base_flange: Float64
-) -> tuple[Callable[[int], Float64], NDArray[np.int8]]:
+    model: ArmModel, rig: Rig, workcell: Workcell, T_base_flange: Float64, *, both: bool
+) -> tuple[Callable[[int], list[tuple[Float64, float]]], NDArray[np.int8], Float64]:
     """Find joints that hold flange poses (C, rolls, 4, 4) and meet nothing, each joint turned as near to home as it can be.
 
-    Returns a function that gives those of one candidate, (N, 6), the nearest to home first. With it come refusals (C,): indices
-    into :data:`REFUSALS` of what stood in the way, -1 for nothing.
+    Returns a function that gives those of one candidate, (6,) with the share of an object that they show: the most first, of
+    alike ones the nearest to home. With it come refusals (C,): indices into :data:`REFUSALS` of what stood in the way, -1 for
+    nothing; and the largest shares (C,). Unless ``both`` cameras matter, shares are NaN and refuse nothing.
     """
-    count = len(T_base_flange)
+    count, rolls = T_base_flange.shape[:2]
     q = workcell.home + wrap(inverse_all(model, T_base_flange, workcell.home) - workcell.home)
     # A joint that may not turn that far may still turn the other way round.
     q = np.where(q > model.high, q - 2 * np.pi, np.where(q < model.low, q + 2 * np.pi, q))
-    q = q.reshape(count, -1, 6)
+    q = q.reshape(count, rolls, -1, 6)
     reached: Bools = np.all((q >= model.low) & (q <= model.high), axis=-1)  # NaN is not
     hits = np.zeros((*reached.shape, len(REASONS)), dtype=bool)
     hits[reached] = obstacles(model, rig, workcell, q[reached], _AIR)
     clear: Bools = reached & ~np.any(hits, axis=-1)
-    cost = np.where(clear, (JOINT_WEIGHTS * np.nan_to_num(q - workcell.home) ** 2).sum(axis=-1), np.inf)
+    refusal = _refusals(reached.reshape(count, -1), hits.reshape(count, -1, len(REASONS)), clear)
+    share = np.full(clear.shape, np.nan)
+    if both:
+        clear[clear] = ~sight.blocked(model, rig, workcell, q[clear])
+        some = clear.any(axis=-1)
+        share[some] = sight.expected(rig, workcell, T_base_flange[some])[:, None]
+        least = _WORTH * float(np.percentile(share[clear], 95)) if clear.any() else 0.0
+        clear &= share >= least
+        refusal[(refusal < 0) & ~clear.any(axis=(1, 2))] = REFUSALS.index("sight")
+    most = np.where(clear, share, 0.0).max(axis=(1, 2))
+    behind = np.floor((most[:, None, None] - np.nan_to_num(share)) / _ALIKE) if both else 0.0
+    away = (JOINT_WEIGHTS * np.nan_to_num(q - workcell.home) ** 2).sum(axis=-1)
+    cost = np.where(clear, away + 1e3 * behind, np.inf).reshape(count, -1)
 
-    def holds(candidate: int) -> Float64:
+    def holds(candidate: int) -> list[tuple[Float64, float]]:
         order = np.argsort(cost[candidate], kind="stable")[: int(clear[candidate].sum())]
         # Rounded to a millionth, goals are the same on machines whose last bits differ.
-        out: Float64 = np.round(q[candidate, order], 6)
-        return out
+        goals, shown = np.round(q[candidate].reshape(-1, 6), 6), share[candidate].reshape(-1)
+        return [(goals[n], float(shown[n])) for n in order]
 
-    return holds, _refusals(reached, hits, ~np.any(clear, axis=1))
+    return holds, refusal, most
 
 
-def _refusals(reached: Bools, hits: Bools, lost: Bools) -> NDArray[np.int8]:
-    """Name for each lost candidate the first obstacle of all its solutions, else ``mixed``."""
+def _refusals(reached: Bools, hits: Bools, clear: Bools) -> NDArray[np.int8]:
+    """Name for each candidate without a clear solution the first obstacle of all its solutions, else ``mixed``."""
+    lost = ~clear.any(axis=(1, 2))
     out = np.where(reached.any(axis=1), -1, REFUSALS.index("reach")).astype(np.int8)
     left = lost & reached.any(axis=1)
     for i, reason in enumerate(REASONS):
@@ -377,23 +446,39 @@ def _about_vertical(angle: float) -> Float64:
 
 
 def _spread(
-    features: Float64, usable: Bools, views: int, accept: Callable[[int], bool], rng: np.random.Generator
-) -> list[int]:
+    features: Float64,
+    usable: Bools,
+    views: int,
+    accept: Callable[[int], bool],
+    rng: np.random.Generator,
+    shares: Float64 | None,
+) -> list[tuple[int, int | None]]:
     """Pick by farthest-point sampling: greedy, so that fewer views are a prefix of more.
 
     Every pick is the farthest of a few random candidates (Mitchell's best candidate). The farthest of all would put nearly
-    every view on the rim of what the arm reaches.
+    every view on the rim of what the arm reaches. Where ``shares`` (C,) tell what candidates show, the one that shows most
+    of the farther half of those few comes with it.
     """
     left = np.flatnonzero(usable)
     gap = np.full(len(features), np.inf)
-    chosen: list[int] = []
+    chosen: list[tuple[int, int | None]] = []
     while len(left) and len(chosen) < views:
         few = rng.choice(left, size=min(_FEW, len(left)), replace=False)
-        k = int(few[gap[few].argmax()])
+        few = few[np.argsort(-gap[few], kind="stable")]
+        k = int(few[0])
         left = left[left != k]
-        if accept(k):
-            chosen.append(k)
-            gap = np.minimum(gap, np.linalg.norm(features - features[k], axis=1))
+        if not accept(k):
+            continue
+        other = None
+        if shares is not None:
+            others = few[1 : _FEW // 2]
+            others = others[np.argsort(-shares[others], kind="stable")]
+            other = next((int(n) for n in others if accept(int(n))), None)
+            # Of few candidates none can be spared.
+            if len(left) > _PLENTY:
+                left = left[left != (k if other is None else other)]
+        chosen.append((k, other))
+        gap = np.minimum(gap, np.linalg.norm(features - features[k], axis=1))
     return chosen
 
 

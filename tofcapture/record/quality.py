@@ -8,6 +8,8 @@ Every check is one number and a limit (:data:`LIMITS`). What is done about it de
     A disturbance that may have passed (a lamp, a lost frame): taken again, three times in all, then kept with the note.
 ``refuse``
     The data are not of this pose, or not there: taken again, three times in all, then the view is given up.
+``elsewhere``
+    The object hides too much from here: taken from the view's other place as well, once; the better one is kept.
 
 Of board views it also says what they cover so far, told from the arm's poses and where the station says the board is. Nothing is
 detected; ``tofcapture calibrate coverage`` says more afterwards.
@@ -29,13 +31,14 @@ from tofcapture.frames import ArmState, StereoFrame, TofBurst, TofInfo
 from tofcapture.meshes import inside
 from tofcapture.ops.phase import Complex128, Decoder, mean_phasors
 from tofcapture.poses import Float64, invert, rotation_angle, transform, transform_points
+from tofcapture.record.sight import covered
 from tofcapture.rig import Rig
 
-NOTE, RETAKE, REFUSE = "note", "retake", "refuse"
+NOTE, RETAKE, REFUSE, ELSEWHERE = "note", "retake", "refuse", "elsewhere"
 
 DARK = 10.0  # raw units; the mean of ten frames knows the range of such a pixel to some 20 mm
 _CELLS = (18, 24)  # of the ToF image, in which overlap is counted
-_COLUMNS = 320  # of the stereo grid are enough for that
+_COLUMNS = 640  # of the stereo grid are enough for that, and for surfaces that it sees from aside
 _BLOCK = 20  # px; side of the blocks whose means are compared between frames
 _CLOCKS = 50_000_000  # ns; how far a device's idea of the host's clock may be off
 _FAR, _NEAR = (
@@ -53,7 +56,7 @@ _FAINT = 50.0  # raw units; changes of fainter blocks are told in parts of this
 class Limit:
     """Largest good value of a number of a view, or smallest where ``least``.
 
-    ``action`` is ``note``, ``retake`` or ``refuse``. ``words`` say what is wrong, with the number as ``{0}``, ``hint`` what
+    ``action`` is ``note``, ``retake``, ``refuse`` or ``elsewhere``. ``words`` say what is wrong, with the number as ``{0}``, ``hint`` what
     to do about it. ``name`` is the number's key, in the file too.
     """
 
@@ -98,6 +101,7 @@ LIMITS = (
     Limit("out_of_reach", 0.5, REFUSE, "{0:.0%} of the scene lies where the ToF frequencies cannot tell its distance", _REACH),
     Limit("frame_drops", 0, RETAKE, "{0:.0f} frames were dropped within the burst", _LINK),
     Limit("flicker", 0.03, RETAKE, "the light changed by {0:.1%} between the frames", "keep people and lamps out of sight; shade the sun"),
+    Limit("object_coverage", 0.55, ELSEWHERE, "both cameras see {0:.0%} of the object well", "come nearer, or see it more from aside", least=True),
     Limit("saturated", 0.05, NOTE, "{0:.0%} of the ToF pixels are saturated", "shorten the exposure; dull what shines"),
     Limit("offset", 0.08, NOTE, "the frequencies' ranges differ by {offset_m:.3f} m, {0:.0%} of what another wrap makes", _OFFSET),
     Limit("dark", 0.5, NOTE, "{0:.0%} of the ToF pixels are too dark for 20 mm", _DULL),
@@ -107,10 +111,18 @@ LIMITS = (
 
 
 def measure(
-    tof: TofBurst, stereo: StereoFrame, before: ArmState, after: ArmState, rig: Rig, frames: int
+    tof: TofBurst,
+    stereo: StereoFrame,
+    before: ArmState,
+    after: ArmState,
+    rig: Rig,
+    frames: int,
+    *,
+    table: bool = False,
 ) -> dict[str, float]:
-    """Find the number of each of :data:`LIMITS`, by name, and ``offset_m``; ``flicker`` only of three frames or more.
+    """Find the number of each of :data:`LIMITS`, by name, and ``offset_m``.
 
+    There is ``flicker`` only of three frames or more, and ``object_coverage`` only where an object stands on a ``table``.
     ``before`` and ``after`` are the arm's states before the first and after the last exposure, ``rig`` counts the overlap,
     ``frames`` ToF frames were asked for.
     """
@@ -121,6 +133,7 @@ def measure(
     dark = float((amplitude < DARK).mean())
     times = np.asarray(tof.time_ns, dtype=np.int64)
     points, pixels = _in_tof_image(stereo, rig)
+    depth, decoded = _decoded(tof, points, pixels, rig)
     found = {
         "motion_m": shift,
         "motion_deg": float(np.degrees(turn)),
@@ -133,18 +146,21 @@ def measure(
         "stereo_coverage": float(np.isfinite(stereo.points[..., 2]).mean()),
         "overlap": _overlap(pixels, rig.tof),
         "misfit": _misfit(tof, phasor),
-        **_decoded(tof, points, pixels, rig),
+        **decoded,
         **_against_stereo(phasor, info, points, pixels, rig.tof),
     }
     if len(tof.raw) >= 3:
         found["flicker"] = _flicker(tof.raw)
+    if table and depth.shape == rig.tof.shape:
+        share = covered(depth, points, rig.tof, before.T_base_flange @ rig.T_flange_tof)
+        found |= {} if np.isnan(share) else {"object_coverage": share}
     return {name: round(value, 7) for name, value in found.items()}
 
 
 def broken_limits(numbers: dict[str, float]) -> list[Limit]:
     """List the limits that numbers break, the gravest first."""
     broken = [limit for limit in LIMITS if limit.name in numbers and limit.broken_by(numbers[limit.name])]
-    return sorted(broken, key=lambda limit: (REFUSE, RETAKE, NOTE).index(limit.action))
+    return sorted(broken, key=lambda limit: (REFUSE, RETAKE, ELSEWHERE, NOTE).index(limit.action))
 
 
 def quality_table(numbers: dict[str, float]) -> dict[str, Any]:
@@ -212,8 +228,10 @@ def _misfit(tof: TofBurst, phasor: Complex128) -> float:
     return max(left)
 
 
-def _decoded(tof: TofBurst, points: Float64, pixels: Float64, rig: Rig) -> dict[str, float]:
-    """Find what ranges of the frequencies differ by, beyond what rig or camera know: metres, and a share of the closest wraps' distance.
+def _decoded(
+    tof: TofBurst, points: Float64, pixels: Float64, rig: Rig
+) -> tuple[NDArray[np.float32], dict[str, float]]:
+    """Find depth (H, W), and what ranges of the frequencies differ by, beyond what rig or camera know: metres, and a share of the closest wraps' distance.
 
     ``exchanged`` is how much nearer depths come to the stereo camera's when frequencies are exchanged; 0 where those stated are near.
     """
@@ -228,7 +246,7 @@ def _decoded(tof: TofBurst, points: Float64, pixels: Float64, rig: Rig) -> dict[
         depths = (Decoder(each, min_amplitude=_BRIGHT)(raw, celsius).depth for each in others)
         least = min((_from_stereo(depth, points, pixels) for depth in depths), default=np.inf)
         found["exchanged"] = away / max(least, _NEAR / 10) if least < _NEAR else 0.0
-    return found
+    return maps.depth, found
 
 
 def _exchange(info: TofInfo, other: dict[float, float]) -> TofInfo:

@@ -20,11 +20,18 @@ from tofcapture.devices.station import Station, open_station
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused, MotionStopped
 from tofcapture.files.seal import write_text
 from tofcapture.files.view import view_path, write_view
-from tofcapture.frames import ArmState, StereoFrame, TofBurst, View
+from tofcapture.frames import CALIBRATION, ArmState, StereoFrame, TofBurst, View
 from tofcapture.record.journal import JobRefused, Journal, keep_copy, reconcile, utc_now
 from tofcapture.record.observer import Observer, Stopped
 from tofcapture.record.plan import Plan, PlannedView, plan_scene
-from tofcapture.record.quality import REFUSE, RETAKE, broken_limits, measure, quality_table
+from tofcapture.record.quality import (
+    ELSEWHERE,
+    REFUSE,
+    RETAKE,
+    broken_limits,
+    measure,
+    quality_table,
+)
 from tofcapture.record.resources import HeldFolders, check_space, full_disk_named, hold_arm, hold_file
 from tofcapture.record.stopping import Stop, stoppable
 
@@ -134,7 +141,7 @@ def _begun(
             journal.agree({"station": station.describe(), "frames": frames, "world": station.world})
             repaired = reconcile(journal, recording, scene)
             failed_before = {row.index for row in journal.rows(scene) if row.state == "failed"}
-            kept = journal.expect(scene, {view.index: view.digest for view in plan.views})
+            kept = journal.expect(scene, {view.index: view.places for view in plan.views})
             observer.planned(plan, kept, repaired)
             check_tof_info(station.tof.describe())
             yield _Run(
@@ -187,10 +194,42 @@ class _Run:
         self.turned = planned.turn
 
     def take(self, planned: PlannedView) -> None:
-        """Move, expose, judge and seal, in three attempts at most; else give the view up.
+        """Move, expose, judge and seal; else give the view up.
 
         Raises :class:`DeviceError`: this view and the one before it failed.
         """
+        try:
+            view = self.attempts(planned)
+        except DeviceError as err:
+            return self.give_up(planned.index, err)
+        reason = ""
+        if planned.spare is not None and _lacking(view):
+            view, reason = self.from_elsewhere(view, planned.spare)
+        self.notes += [
+            f"view {planned.index}: {note['words']}" for note in view.provenance["quality"]["notes"]
+        ]
+        return self.seal(view, reason)
+
+    def from_elsewhere(self, view: View, spare: PlannedView) -> tuple[View, str]:
+        """Take a view that shows too little of its object from its other place too; the better one, and why if that is the other."""
+        quality = view.provenance["quality"]
+        words = next(note["words"] for note in quality["notes"] if note["action"] == ELSEWHERE)
+        try:
+            other = self.attempts(spare)
+        except DeviceError as err:
+            self.stop.check()
+            words, better = f"{words}; not taken from its other place: {err.message}", view
+        else:
+            there = other.provenance["quality"].get("object_coverage", 0.0)
+            better = other if there > quality["object_coverage"] else view
+            words = f"{words}, {there:.0%} from its other place, which is {'kept' if better is other else 'no better'}"
+        notes = better.provenance["quality"]["notes"]
+        notes[:] = [n for n in notes if n["check"] != "object_coverage"]
+        notes.append({"check": "object_coverage", "action": ELSEWHERE, "words": words})
+        return better, words if better is not view else ""
+
+    def attempts(self, planned: PlannedView) -> View:
+        """Move, expose and judge, in three attempts at most; raises :class:`DeviceError` when the last one failed."""
         for attempt in range(1, ATTEMPTS + 1):
             self.journal.attempt(self.scene, planned.index)
             try:
@@ -205,16 +244,14 @@ class _Run:
                 self.stop.check()
                 # A refused motion is refused for good.
                 if attempt == ATTEMPTS or isinstance(err, MotionRefused):
-                    return self.give_up(planned.index, err)
+                    raise
                 continue
             broken = broken_limits(numbers)
             if attempt == ATTEMPTS or not any(limit.action == RETAKE for limit in broken):
                 break
-        self.notes += [f"view {planned.index}: {limit.sentence(numbers)}" for limit in broken]
         provenance = {**self.provenance(planned), "quality": quality_table(numbers)}
         truth, rig = self.station.operator.truth(), self.station.rig
-        self.seal(View(self.scene, planned.index, tof, stereo, before, after, rig, provenance, truth))
-        return None
+        return View(self.scene, planned.index, tof, stereo, before, after, rig, provenance, truth)
 
     def move(self, planned: PlannedView) -> ArmState:
         """Move by a clear way; the arm returns settled."""
@@ -258,14 +295,15 @@ class _Run:
         """Refuse what is not what a driver promises, measure what came, refuse what is of no use (``record.quality``)."""
         check_burst(tof, self.station.tof.describe(), before)
         check_points(stereo, self.station.stereo.describe())
-        numbers = measure(tof, stereo, before, after, self.station.rig, self.frames)
+        table = not self.station.arm.by_hand and self.scene != CALIBRATION
+        numbers = measure(tof, stereo, before, after, self.station.rig, self.frames, table=table)
         for limit in broken_limits(numbers):
             if limit.action == REFUSE:
                 raise Refused(limit.sentence(numbers), hint=limit.hint)
         return numbers
 
-    def seal(self, view: View) -> None:
-        """Write a view under its name, then note it in the journal."""
+    def seal(self, view: View, reason: str = "") -> None:
+        """Write a view under its name, then note it in the journal, with the reason of another pose than planned."""
         self.begin(view.index, "sealing")
         path = view_path(self.recording, self.scene, view.index)
         with self.folders.unchanged():
@@ -273,7 +311,7 @@ class _Run:
                 self.journal.forget(self.scene, view.index, "taken again")
                 keep_copy(path, "retaken")
             digest = write_view(path, view)
-        self.journal.seal(self.scene, view.index, digest)
+        self.journal.seal(self.scene, view.index, digest, view.provenance["pose"], reason)
         self.observer.sealed(view, digest)
         self.recorded.append(view.index)
         self.failed_in_a_row = 0
@@ -328,3 +366,8 @@ class _Run:
         reasons = tuple(f"view {i}: {self.reasons[i]}" for i in failed)
         repaired, notes = tuple(self.repaired), tuple(self.notes)
         return RecordResult(self.scene, recorded, kept, failed, reasons, repaired, self.plan, notes)
+
+
+def _lacking(view: View) -> bool:
+    """Whether a view shows so little of its object that it is worth a look from elsewhere."""
+    return any(note["action"] == ELSEWHERE for note in view.provenance["quality"]["notes"])

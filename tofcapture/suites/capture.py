@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -132,9 +132,9 @@ def _by_arm(job: Job, world: SimWorld) -> Iterator[tuple[int, ArmState, SimClock
     context = StationContext(config=config, folder=Path(), shared={"sim": world})
     workcell = workcell_of(config)
     rng = generator(job.scene.plan_name, job.seed, "suite plan")
-    plan = plan_views(
-        model, world.nominal_rig(), workcell, workcell.target, object_sampling(), job.views, rng
-    )
+    # Networks learn from afar and from straight above as well, where a scene's ground truth has more gaps.
+    sampling = replace(object_sampling(), both=False)
+    plan = plan_views(model, world.nominal_rig(), workcell, workcell.target, sampling, job.views, rng)
     with SimArm({"model": config["arm"]["model"]}, context) as arm:
         for planned in plan.views:
             yield planned.index, arm.move_to(planned.joints), shared_clock(context)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tofcapture.devices.clearance import Workcell
+from tofcapture.devices.clearance import COLUMN, Workcell
 from tofcapture.files.seal import write_text
 from tofcapture.poses import Float64, transform_points
 from tofcapture.record.plan import REMEDIES, Plan, PlannedView
@@ -17,9 +17,8 @@ from tofcapture.viz.page import LINES, canvas, frustum, svg_text
 
 _REACH = 0.12  # m; how long the pyramids are drawn
 _DOTS = 1500  # refused candidates that are drawn, of what there are
-_COLUMN = 0.20  # m; the base and what must not come near it
 _RED, _PINK, _GREY = "#d93025", "#fce8e6", "#5f6368"
-_REASONS = ("#9aa0a6", "#b5651d", "#d93025", "#7b1fa2", "#c2185b", "#5f6368", "#f9ab00")
+_REASONS = ("#9aa0a6", "#b5651d", "#d93025", "#7b1fa2", "#c2185b", "#5f6368", "#188038", "#f9ab00")
 _SIDES = (((0, 1), "from above"), ((0, 2), "from the side"))
 
 
@@ -75,7 +74,7 @@ def _draw_above(axes: Any, workcell: Workcell) -> None:
     axes.add_patch(
         Circle((workcell.target[0], workcell.target[1]), workcell.keep_out_radius, fc=_PINK, ec=_RED)
     )
-    axes.add_patch(Circle((0, 0), _COLUMN, fc="#e8eaed", ec=_GREY))
+    axes.add_patch(Circle((0, 0), COLUMN, fc="#e8eaed", ec=_GREY))
     axes.text(0, 0, "base", ha="center", va="center")
 
 
@@ -87,7 +86,7 @@ def _draw_side(axes: Any, workcell: Workcell) -> None:
         (workcell.target[0] - r, workcell.table), 2 * r, workcell.keep_out_height, fc=_PINK, ec=_RED
     )
     axes.add_patch(keep_out)
-    axes.add_patch(Rectangle((-_COLUMN, -0.02), 2 * _COLUMN, 0.04, fc="#e8eaed", ec=_GREY))
+    axes.add_patch(Rectangle((-COLUMN, -0.02), 2 * COLUMN, 0.04, fc="#e8eaed", ec=_GREY))
     axes.text(0, 0.03, "base", ha="center")
     axes.axhline(workcell.table, color="#795548", lw=2.5)
     axes.text(axes.get_xlim()[0], workcell.table, " table", va="top")
@@ -136,6 +135,7 @@ def _titled(svg: str, plan: Plan) -> str:
     """Give every view a title, which browsers show under the pointer."""
     titles = {
         f"view-{v.index}": f"view {v.index}: {v.distance:.2f} m, object turned by {np.degrees(v.turn):.0f} deg"
+        + ("" if np.isnan(v.coverage) else f", {v.coverage:.0%} of it covered")
         for v in plan.views
     }
     return re.sub(r'<g id="(view-\d+)">', lambda m: f'<g class="view"><title>{titles[m[1]]}</title>', svg)
