@@ -155,10 +155,10 @@ def blocked(model: ArmModel, rig: Rig, workcell: Workcell, joints: Float64) -> B
     start = places[..., 0] + T_base_flange[:, None, :3, 3]
     sights = np.stack([start, np.broadcast_to(workcell.target, start.shape)], axis=-2)  # (N, 3, 2, 3)
     stand = np.array([[0.0, 0.0, workcell.table], [0.0, 0.0, 0.0]])
-    near: Bools = segment_gap(stand, sights) < COLUMN
+    gaps = [segment_gap(stand, sights) - COLUMN]
     for i in range(body.arm.shape[1] - WRIST):
-        near |= segment_gap(body.arm[:, None, i], sights) < body.radii[0][i]
-    out: Bools = near.any(axis=1)
+        gaps.append(segment_gap(body.arm[:, None, i], sights) - body.radii[0][i])
+    out: Bools = (np.stack(gaps) < 0).any(axis=(0, 2))
     return out
 
 
@@ -180,7 +180,8 @@ def covered(depth: NDArray[np.float32], points: Float64, camera: Camera, T_base_
 
     def stands(image: NDArray[np.float32], clear: float) -> Bools:
         above = replace(crop, clearance=max(crop.clearance, clear))
-        return np.isfinite(crop_depth(above, image, camera))
+        out: Bools = np.isfinite(crop_depth(above, image, camera))
+        return out
 
     thing, hidden = stands(seen, _CLEAR), ~there & stands(depth, _TOF_CLEAR)
     if thing.sum() + hidden.sum() < _FEWEST:
