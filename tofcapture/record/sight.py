@@ -155,10 +155,10 @@ def blocked(model: ArmModel, rig: Rig, workcell: Workcell, joints: Float64) -> B
     start = places[..., 0] + T_base_flange[:, None, :3, 3]
     sights = np.stack([start, np.broadcast_to(workcell.target, start.shape)], axis=-2)  # (N, 3, 2, 3)
     stand = np.array([[0.0, 0.0, workcell.table], [0.0, 0.0, 0.0]])
-    gaps = [segment_gap(stand, sights) - COLUMN]
-    for i in range(body.arm.shape[1] - WRIST):
-        gaps.append(segment_gap(body.arm[:, None, i], sights) - body.radii[0][i])
-    out: Bools = (np.stack(gaps) < 0).any(axis=(0, 2))
+    pieces = range(body.arm.shape[1] - WRIST)
+    gaps = [segment_gap(body.arm[:, None, i], sights) - body.radii[0][i] for i in pieces]
+    gaps.append(segment_gap(stand, sights) - COLUMN)
+    out: Bools = (np.concatenate(gaps, axis=1) < 0).any(axis=1)
     return out
 
 
