@@ -158,7 +158,7 @@ def blocked(model: ArmModel, rig: Rig, workcell: Workcell, joints: Float64) -> B
     pieces = range(body.arm.shape[1] - WRIST)
     gaps = [segment_gap(body.arm[:, None, i], sights) - body.radii[0][i] for i in pieces]
     gaps.append(segment_gap(stand, sights) - COLUMN)
-    out: Bools = (np.concatenate(gaps, axis=1) < 0).any(axis=1)
+    out: Bools = np.any(np.concatenate(gaps, axis=1) < 0, axis=1)
     return out
 
 
