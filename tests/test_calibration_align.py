@@ -36,8 +36,10 @@ from tests import answers
 from tofcapture import poses
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, QualityError
-from tofcapture.files.view import view_path, write_view
+from tofcapture.files.view import open_view, view_path, write_view
 from tofcapture.frames import ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, Truth, View
+from tofcapture.importing.said import Said
+from tofcapture.importing.views import import_data
 from tofcapture.libraries import load_open3d
 from tofcapture.ops import phase
 from tofcapture.rig import SPEED_OF_LIGHT, RangeError, Rig, load_rig
@@ -202,6 +204,29 @@ def test_align_recovers_the_rig(aligned):
     assert translation < 0.001
     assert evidence["truth"]["rotation_error_deg"] == pytest.approx(np.degrees(rotation))
     assert evidence["truth"]["translation_error_mm"] == pytest.approx(1e3 * translation)
+
+
+def test_align_finds_the_second_camera_of_imported_views(views, tmp_path):
+    """Taps and point maps of the board, without a word of how the cameras stand; what comes after is placed by the answer."""
+    for view in views:
+        np.save(tmp_path / f"raw_{view.index}.npy", view.tof.raw)
+        np.save(tmp_path / f"points_{view.index}.npy", view.stereo.points)
+    tof = {k: getattr(TOF, k) for k in ("fx", "fy", "cx", "cy")}
+    with pytest.raises(ConfigError, match=r"missing \[truth\] T_tof_truth") as info:
+        import_data([tmp_path], tmp_path / "rec", Said(scene="mug", tof=tof))
+    assert "--scene calibration" in info.value.hint
+    found = import_data([tmp_path], tmp_path / "rec", Said(scene="calibration", tof=tof))
+    assert f"align {tmp_path / 'rec'} --initial none" in found.warnings[0]
+    rig, _ = align(tmp_path / "rec", initial=views[0].rig)
+    rotation, translation = alignment_error(rig.T_tof_stereo, TRUE)
+    assert np.degrees(rotation) < 0.1
+    assert translation < 0.001
+    (tmp_path / "mug").mkdir()
+    for name in ("raw_0.npy", "points_0.npy"):
+        (tmp_path / name).rename(tmp_path / "mug" / name)
+    import_data([tmp_path / "mug"], tmp_path / "rec", Said(scene="mug", tof=tof))
+    mug = open_view(view_path(tmp_path / "rec", "mug", 0))
+    np.testing.assert_allclose(mug.rig.T_tof_stereo, rig.T_tof_stereo, atol=1e-12)
 
 
 def test_align_keeps_what_it_does_not_measure(aligned):

@@ -42,11 +42,11 @@ class Overlap:
         return float(np.nanmedian(both)) if np.isfinite(both).any() else float("nan")
 
 
-def compare(view: View, where: str, model: str) -> Overlap:
-    """Compare; :class:`DataError` for ground truth that misses the image, or that fits much better mirrored, turned or scaled."""
+def compare(view: View, where: str, model: str, *, placed: bool = True) -> Overlap:
+    """Compare, where it is known how the cameras stand; :class:`DataError` for ground truth that misses the image, or that fits much better mirrored, turned or scaled."""
     decoded = Decoder(view.tof.info).burst(view.tof.raw, float(np.mean(view.tof.celsius)))
     tof = decoded.depth
-    if model == NO_TRUTH:
+    if model == NO_TRUTH or not placed:
         return Overlap(tof, np.full_like(tof, np.nan), decoded.confidence, model)
     truth = seen(view, view.rig.T_tof_stereo)
     found = Overlap(tof, truth, decoded.confidence, model)

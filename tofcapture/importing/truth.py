@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tofcapture.camera import Camera, distorted
 from tofcapture.errors import ConfigError, DataError
+from tofcapture.files.layout import BOARD_SCENE
 from tofcapture.frames import NO_TRUTH
 from tofcapture.importing.plan import Planned
 from tofcapture.importing.rules import FARTHEST, NEAREST, Float32, metres
@@ -19,6 +20,9 @@ from tofcapture.meshes import UNITS
 from tofcapture.poses import Float64, invert, transform_points
 
 _GRID = 0.5  # px that a point map may be off the pinhole that fits it
+_ELSE = (
+    "views of the calibration board find it: import them first, --scene calibration, then tofcapture align"
+)
 _ONE_SURFACE = 0.02  # of depth; neighbours that differ by more are not interpolated
 
 
@@ -30,10 +34,13 @@ class PointMap:
     camera: Camera  #: A pinhole.
     T_tof_stereo: Float64  #: (4, 4)
     model: str  #: What it was made of; :data:`tofcapture.frames.NO_TRUTH` when there is no ground truth.
+    placed: bool = (
+        True  #: Whether somebody says how its camera stands; views of the board are there to find it.
+    )
 
 
-def point_map(view: Planned, said: Said, tof: Camera) -> PointMap:
-    """Make the point map of a view.
+def point_map(view: Planned, said: Said, tof: Camera, T_tof_stereo: Float64 | None = None) -> PointMap:
+    """Make the point map of a view; ``T_tof_stereo`` is how a second camera stands, where the source does not say.
 
     Without ground truth it is empty, on the grid of the ToF camera. Raises :class:`DataError` or :class:`ConfigError`: units,
     shapes or frames that cannot be, with what to write into ``import.toml``.
@@ -59,18 +66,27 @@ def point_map(view: Planned, said: Said, tof: Camera) -> PointMap:
         )
     T = said.transform("T_tof_truth")
     T = view.T_tof_truth if T is None else T
+    T = (
+        T_tof_stereo
+        if T is None and (said.truth_camera() or view.truth_facts.camera or kind == "points")
+        else T
+    )
     unit = str(said.truth.get("unit", "") or view.truth_facts.unit)
     missing = said.tuple_of("truth", "missing")
     camera = said.truth_camera() or view.truth_facts.camera
+    placed = T is not None or view.scene != BOARD_SCENE or (camera is None and kind != "points")
+    T = T if placed else np.eye(4)
     if kind == "points":
-        return _of_points(values, unit, missing, camera, T, where)
-    depth = metres(values, unit, missing, where)
-    return _of_depth(depth, kind == "radial", camera, T, tof, where)
+        found = _of_points(values, unit, missing, camera, T, where)
+    else:
+        depth = metres(values, unit, missing, where)
+        found = _of_depth(depth, kind == "radial", camera, T, tof, where)
+    return replace(found, placed=placed)
 
 
 def _is_map(points: NDArray[Any], view: Planned, said: Said) -> bool:
     """Whether points (H, W, 3) of a cloud are seen by a pinhole that stands where somebody says; others are a surface."""
-    if said.transform("T_tof_truth") is None and view.T_tof_truth is None:
+    if said.transform("T_tof_truth") is None and view.T_tof_truth is None and view.T_world_tof is not None:
         return False
     try:
         pinhole_of(np.where((points == 0).all(axis=-1, keepdims=True), np.nan, points), "")
@@ -99,7 +115,7 @@ def _of_depth(
     if camera is not None and T is None:
         raise ConfigError(
             f"{where}: where its camera stands is not known: missing [truth] T_tof_truth",
-            hint="the (4, 4) that maps its frame to the ToF frame, metres; rows of numbers in import.toml",
+            hint=f"the (4, 4) that maps its frame to the ToF frame, metres; {_ELSE}",
         )
     own = camera or tof
     z = np.asarray(depth / own.ray_lengths if radial else depth, dtype=np.float32)
@@ -155,7 +171,7 @@ def _of_points(
     if T is None:
         raise ConfigError(
             f"{where}: where its camera stands is not known: missing [truth] T_tof_truth",
-            hint="the (4, 4) that maps its frame to the ToF frame, metres; of one and the same camera it has ones on the diagonal",
+            hint=f"the (4, 4) that maps its frame to the ToF frame, metres; of one and the same camera it has ones on the diagonal; {_ELSE}",
         )
     return PointMap(points, fitted, T, "imported points")
 

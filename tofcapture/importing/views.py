@@ -149,15 +149,23 @@ def _import_view(out: Path, planned: Planned, said: Said, result: Imported, seen
                 return
         except DataError:
             pass  # made by a run that was killed, and damaged since: it is made again
-    view, overlap = make_view(planned, said)
+    rig = load_rig(out / "rig.toml") if (out / "rig.toml").is_file() else None
+    view, overlap, placed = _made(planned, said, rig)
+    view = _of_one_camera(out, view, rig)
     for text in (
         *overlap.warnings,
         *([] if planned.truth else [f"{planned.scene}: no ground truth: predict only"]),
         *_copied(view, planned.pieces[0].name, seen),
+        *(
+            []
+            if placed
+            else [f"{out}: how the second camera stands is not known: tofcapture align {out} --initial none"]
+        ),
     ):
         if text not in result.warnings:
             result.warnings.append(text)
-    _keep_rig(out, view.rig, overlap.model)
+    if placed:
+        _keep_rig(out, view.rig, overlap.model)
     write_view(path, replace(view, provenance={"import": inputs, "tofcapture": __version__}))
 
 
@@ -172,15 +180,31 @@ def _copied(view: View, name: str, seen: dict[str, str]) -> list[str]:
     return []
 
 
+def _of_one_camera(out: Path, view: View, rig: Rig | None) -> View:
+    """Give a view the second camera of those before it, where it was fitted to points: what differs is noise."""
+    if rig is None:
+        made = next((p for root in (out, out / UNFINISHED) for p in sorted(root.glob("**/view-*.h5"))), None)
+        rig = open_view(made).rig if made else None
+    if rig is None or rig.stereo == view.rig.stereo or not _alike(rig.stereo, view.rig.stereo):
+        return view
+    stereo = replace(view.stereo, info=replace(view.stereo.info, camera=rig.stereo))
+    return replace(view, stereo=stereo, rig=replace(view.rig, stereo=rig.stereo))
+
+
 def make_view(planned: Planned, said: Said) -> tuple[View, Overlap]:
     """Make one view and say how its ground truth lies over the ToF image; raises as :func:`import_data` does."""
+    return _made(planned, said, None)[:2]
+
+
+def _made(planned: Planned, said: Said, rig: Rig | None) -> tuple[View, Overlap, bool]:
+    """Make one view, say how its ground truth lies, and whether that is known; by ``rig`` where the source does not say."""
     where = planned.pieces[0].name
     raw = integers(planned.raw(), where)
     info = said.tof_info(planned.facts, (raw.shape[-2], raw.shape[-1]))
     warning = judged(
         raw, info, where, known=bool(planned.facts.modulation_hz or "modulation_mhz" in said.tof)
     )
-    found = point_map(planned, said, info.camera)
+    found = point_map(planned, said, info.camera, None if rig is None else rig.T_tof_stereo)
     rig = Rig(info.camera, found.camera, found.T_tof_stereo, np.eye(4), info.illuminator, (), info.reach)
     each = max(len(planned.time_ns) // len(raw), 1)  # images of a frame
     stamps = planned.time_ns[::each] if len(planned.time_ns) == each * len(raw) else tuple(range(len(raw)))
@@ -198,8 +222,9 @@ def make_view(planned: Planned, said: Said) -> tuple[View, Overlap]:
         replace(arm, time_ns=stamps[-1]),
         rig,
     )
-    overlap = compare(view, where, found.model)
-    return view, replace(overlap, warnings=(*([warning] if warning else []), *overlap.warnings))
+    overlap = compare(view, where, found.model, placed=found.placed)
+    overlap = replace(overlap, warnings=(*([warning] if warning else []), *overlap.warnings))
+    return view, overlap, found.placed
 
 
 def integers(raw: NDArray[Any], where: str) -> NDArray[Any]:
