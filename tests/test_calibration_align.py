@@ -206,6 +206,7 @@ def test_align_recovers_the_rig(aligned):
     assert evidence["truth"]["translation_error_mm"] == pytest.approx(1e3 * translation)
 
 
+@pytest.mark.slow
 def test_align_finds_the_second_camera_of_imported_views(views, tmp_path):
     """Taps and point maps of the board, without a word of how the cameras stand; what comes after is placed by the answer."""
     for view in views:

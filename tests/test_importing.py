@@ -372,6 +372,21 @@ def test_frames_that_are_copies_are_told(tmp_path):
     assert [w.split(": ")[1] for w in found.warnings] == ["view 2, frame 0 is view 0, frame 0, bit for bit"]
 
 
+def test_one_frequency_does_not_tell_which_way_its_phases_run(tmp_path):
+    """Ground truth tells; without it the doubt is told."""
+    raw, depth = scenes(1)
+    np.save(tmp_path / "raw_0.npy", raw[0, :4])
+    turned = {**TOF, "modulation_mhz": [20] * 4, "phase_deg": [0, 270, 180, 90]}
+    found = import_data([tmp_path], tmp_path / "alone", Said(tof=turned))
+    assert any("which way its phases run" in w for w in found.warnings)
+    np.save(tmp_path / "depth_0.npy", depth[0])
+    with pytest.raises(TofError, match="mm off") as info:
+        import_data([tmp_path], tmp_path / "rec", Said(tof=turned))
+    assert "here the other way, phase_deg = [0.0, 90.0, 180.0, 270.0]" in info.value.hint
+    right = {**turned, "phase_deg": [0, 90, 180, 270]}
+    assert import_data([tmp_path], tmp_path / "rec", Said(tof=right)).warnings == []
+
+
 FIELD = {  # as tools of the field name and keep their files
     "stamps of a camera's recorder": lambda i: (f"Phase{{k}}_{1700000000123.456 + 33.3 * i:.12f}.png", f"Depth_{1700000000123.456 + 33.3 * i:.12f}.png"),
     "a stamp for each image": lambda i: (f"Phase{{k}}_{{{1700000000123 + 1000 * i} + 3 * k}}.png", f"Depth_{1700000000123 + 1000 * i}.png"),

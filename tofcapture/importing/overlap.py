@@ -9,10 +9,11 @@ import numpy as np
 
 from tofcapture.errors import DataError
 from tofcapture.frames import NO_TRUTH, View
-from tofcapture.importing.rules import Float32
+from tofcapture.importing.rules import Float32, sign_unknown
 from tofcapture.importing.truth import nearest
 from tofcapture.ops.phase import Decoder
 from tofcapture.poses import Float64, transform_points
+from tofcapture.rig import SPEED_OF_LIGHT
 
 _WRONG = 0.03  # m of median difference from which a better reading is looked for
 _BETTER = 3.0  # times smaller differences of another reading
@@ -88,5 +89,11 @@ def _better(tof: Float32, truth: Float32, view: View, off: float) -> str:
     if truth.shape[0] == truth.shape[1]:
         readings['rows and columns have changed places: [truth] axes = "WH" in import.toml'] = truth.T
     scores = {words: float(np.nanmedian(np.abs(t - tof))) for words, t in readings.items()}
+    if turned := sign_unknown(view.tof.info):
+        reach = SPEED_OF_LIGHT / 2 / view.tof.info.modulation_hz[0]
+        other = (reach - tof * lengths) / lengths
+        scores[turned.replace("if near comes out far", "here the other way")] = float(
+            np.nanmedian(np.abs(truth - other))
+        )
     words = min(scores, key=lambda w: scores[w])
     return words if scores[words] * _BETTER < off else ""

@@ -96,6 +96,16 @@ def _other_bytes(raw: NDArray[Any]) -> str:
     return "the bytes of each word have changed places: raw.byteswap(), or of plain words [raw] dtype = '>u2' in import.toml"
 
 
+def sign_unknown(info: TofInfo) -> str:
+    """Say that no frame of one frequency tells which way its phases run; nothing for several, which contradict each other."""
+    if len(frequencies(info.modulation_hz)) > 1:
+        return ""
+    turned = [round(float(d), 3) for d in np.degrees(np.negative(info.phase_rad)) % 360]
+    return (
+        f"one frequency: no frame tells which way its phases run; if near comes out far, phase_deg = {turned}"
+    )
+
+
 def burst_mean(raw: NDArray[Any], info: TofInfo) -> NDArray[np.float64]:
     """Average a burst (F, K, H, W).
 

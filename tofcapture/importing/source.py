@@ -124,5 +124,8 @@ def _paths(source: Path, readers: list[Reader]) -> Iterator[Path]:
         yield source
         return
     for path in sorted(source.iterdir(), key=lambda p: natural(p.name)):
-        if not path.name.startswith(".") and path.name != "import.toml":
+        ours = (
+            path.name in {"import.toml", "import.png"} or (path / "rig.toml").is_file()
+        )  # a recording that lies inside
+        if not path.name.startswith(".") and not ours:
             yield from _paths(path, readers)

@@ -22,7 +22,14 @@ from tofcapture.files.view import open_view, view_path, write_view
 from tofcapture.frames import NO_TRUTH, ArmState, StereoFrame, StereoInfo, TofBurst, TofInfo, View
 from tofcapture.importing.overlap import Overlap, compare
 from tofcapture.importing.plan import Planned, plan
-from tofcapture.importing.rules import burst_mean, check_taps, check_unit, expect_finite, signed
+from tofcapture.importing.rules import (
+    burst_mean,
+    check_taps,
+    check_unit,
+    expect_finite,
+    sign_unknown,
+    signed,
+)
 from tofcapture.importing.said import NAME, Said, read_said
 from tofcapture.importing.truth import point_map
 from tofcapture.poses import Float64
@@ -223,7 +230,9 @@ def _made(planned: Planned, said: Said, rig: Rig | None) -> tuple[View, Overlap,
         rig,
     )
     overlap = compare(view, where, found.model, placed=found.placed)
-    overlap = replace(overlap, warnings=(*([warning] if warning else []), *overlap.warnings))
+    told = planned.truth is not None or planned.facts.model
+    more = [warning, "" if told else sign_unknown(info)]
+    overlap = replace(overlap, warnings=(*filter(None, more), *overlap.warnings))
     return view, overlap, found.placed
 
 

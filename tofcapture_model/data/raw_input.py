@@ -23,6 +23,7 @@ from tofcapture.importing.rules import (
     check_unit,
     expect_finite,
     expect_shape,
+    sign_unknown,
 )
 from tofcapture.importing.said import Facts
 from tofcapture.rig import RangeError
@@ -152,7 +153,7 @@ def from_arrays(
     celsius = np.full(len(raw), np.nan)
     taps, _ = taken(raw, frame, plain, celsius)
     expect_finite(taps, f"{path}{_which(raw, frame)}")
-    warning = check_unit(raw, plain, path)
+    warning = "; ".join(filter(None, (check_unit(raw, plain, path), sign_unknown(plain))))
     if rig:
         info, assumed = plain, ""
         check_taps(taps, info, path, _which(raw, frame))
