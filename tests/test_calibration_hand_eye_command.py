@@ -335,8 +335,44 @@ STREAMS = {
         f"[{s:.9g}, " + ", ".join(f"{x:.9g}" for x in row) + "],\n"
         for s, row in zip(t, euler(T, "rotvec", degrees=False), strict=True)
     ),
+    "ros2 topic echo": lambda t, T: "".join(
+        yaml.safe_dump(
+            {
+                "header": {"stamp": {"sec": int(s), "nanosec": round(s % 1 * 1e9)}, "frame_id": "base"},
+                "pose": {"position": ros(one)["translation"], "orientation": ros(one)["rotation"]},
+            }
+        )
+        + "---\n"
+        for s, one in zip(t, T, strict=True)
+    ),
+    "ros2 topic echo --csv": lambda t, T: "".join(
+        f"{int(s)},{round(s % 1 * 1e9)},base," + ",".join(f"{x:.9g}" for x in row) + "\n"
+        for s, row in zip(t, rows(T), strict=True)
+    ),
     "json": lambda t, T: json.dumps({"seconds": t.tolist(), "poses": rows(T).tolist()}),
 }
+
+
+TURNS = Rotation.from_matrix(R_HAND).as_euler("ZYX", degrees=True)
+PENDANTS = {  # as the arms' own programs print them, without times
+    "UR's variables": text(euler(HAND, "rotvec", degrees=False)).replace("\n", "]\nhome = p[").join(("home = p[", "")),
+    "KUKA's E6POS": "".join(
+        "DECL E6POS XP1={" + ",".join(f"{n} {x:.6f}" for n, x in zip("XYZABC", (*p, *turn), strict=True)) + ",S 6,T 27,E1 0.0}\n"
+        for p, turn in zip(1e3 * HAND[:, :3, 3], TURNS, strict=True)
+    ),
+    "Franka's O_T_EE": json.dumps([{"O_T_EE": T.T.ravel().tolist()} for T in HAND]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", PENDANTS)
+def test_what_an_arm_prints_is_read(tmp_path, form):
+    """Lengths as they are, no status taken for a time."""
+    path = tmp_path / ("poses.json" if "Franka" in form else "poses.txt")
+    path.write_text(PENDANTS[form].removesuffix("home = p["))
+    found = read_poses(path)
+    scale = 1e-3 if "KUKA" in form else 1
+    np.testing.assert_allclose(scale * found.xyz, HAND[:, :3, 3], atol=1e-6)
+    assert found.seconds is None
 
 
 @pytest.mark.parametrize("form", STREAMS)

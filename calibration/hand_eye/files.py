@@ -35,7 +35,7 @@ TARGET = (
 )  # fmt: skip
 LISTS = ("samples", "pairs", "poses", "data", "transforms")
 SECONDS = ("seconds", "t", "time", "stamps")
-WRAPPED = ("transform", "pose", "matrix", "t_matrix", "homogeneous")
+WRAPPED = ("transform", "pose", "matrix", "t_matrix", "homogeneous", "o_t_ee")
 TRANSLATION = ("translation", "position", "trans", "t", "xyz", "tvec")
 ROTATION = ("rotation", "orientation", "quaternion", "rot", "q", "quat", "r", "rvec", "rmat")
 HEADERS = {  # what three angles or a quaternion are called -> the usual reading of them in that order
@@ -63,6 +63,7 @@ REMEDIES = {
     ".db3": "write the poses as CSV: t,x,y,z,qx,qy,qz,qw",
     ".xlsx": "save the sheet as CSV",
     ".xls": "save the sheet as CSV",
+    ".mod": "write each robtarget's numbers as x,y,z,qw,qx,qy,qz under that header line",
     ".pkl": "numpy.savez('poses.npz', hand=..., target=...) with (N, 4, 4) arrays",
     ".h5": "numpy.savez('poses.npz', hand=..., target=...) with (N, 4, 4) arrays",
     ".png": "hand-eye takes poses: detect the target first, or give a calibration recording",
@@ -97,7 +98,7 @@ def read_poses(path: Path) -> Readings:
     if isinstance(content, str):
         return _by_columns(*_table(content, str(path)), str(path))
     if not isinstance(content, Mapping):
-        return readings_of(list(content), str(path))
+        return replace(readings_of(list(content), str(path)), seconds=_stamps(content))
     held = _lower(content)
     seconds, poses = _first(held, SECONDS), _first(held, LISTS)
     sides = {} if poses is not None else _sides(held, str(path))
@@ -105,6 +106,20 @@ def read_poses(path: Path) -> Readings:
         raise FormatError(f"{path}: expected poses under one of {', '.join(LISTS)}, got {', '.join(held)}")
     found = readings_of(list(poses), str(path)) if poses is not None else next(iter(sides.values()))
     return found if seconds is None else replace(found, seconds=np.asarray(seconds, float).ravel())
+
+
+def _stamps(messages: Sequence[Any]) -> Float64 | None:
+    """Seconds of the headers of messages that ROS printed; ``None`` for other poses."""
+    try:
+        stamps = [m["header"]["stamp"] for m in messages]
+        return np.array(
+            [
+                float(s.get("sec", s.get("secs"))) + 1e-9 * float(s.get("nanosec", s.get("nsecs")))
+                for s in stamps
+            ]
+        )
+    except (KeyError, TypeError, AttributeError):
+        return None
 
 
 def readings_of(values: Sequence[Any], where: str) -> Readings:
@@ -293,7 +308,10 @@ def _of_rows(rows: Float64, where: str, usual: str = "", unit: str = "", angles:
     """Read rows of 6, 7, 12 or 16 numbers; ``usual`` names their rotation's reading where a header or a dictionary told it."""
     if not np.isfinite(rows).all():
         bad = int(np.argmax(~np.isfinite(rows).all(axis=1)))
-        raise DataError(f"{where}: expected finite numbers, got NaN or infinity in pose {bad}")
+        raise DataError(
+            f"{where}: expected finite numbers, got NaN, infinity or a word in pose {bad}",
+            hint="leave out poses in which the target was not seen; a line holds numbers alone: t,x,y,z,qx,qy,qz,qw",
+        )
     width = rows.shape[1]
     if width in {12, 16}:
         return _of_matrices(rows, where, unit)
@@ -366,11 +384,19 @@ def _table(text: str, where: str) -> tuple[Float64, list[str]]:
             continue
         if values is None or comment or (rows and len(values) != len(rows[0])):
             expected = f"{len(rows[0])} numbers" if rows else "numbers"
-            raise FormatError(f"{where}:{number}: expected {expected}, got {line.strip()[:60]!r}")
+            raise FormatError(
+                f"{where}:{number}: expected {expected}, got {line.strip()[:60]!r}",
+                hint="one pose a line: t,x,y,z,qx,qy,qz,qw; rostopic echo -p and ros2 topic echo --csv print such lines",
+            )
         rows.append(values)
     if not rows:
-        raise DataError(f"{where}: expected poses, one a line, got none")
+        raise DataError(
+            f"{where}: expected poses, one a line, got none",
+            hint="numbers alone, one pose a line: x,y,z,qx,qy,qz,qw, with a time before them or not",
+        )
     table = np.array(rows)
+    if not names and len(rows) > 1:  # columns of words
+        table = table[:, ~np.isnan(table).all(axis=0)]
     if table.shape[1] == 4 and len(table) % 4 == 0 and np.all(table[3::4] == [0, 0, 0, 1]):
         return table.reshape(-1, 16), []  # a matrix every four lines
     return table, names
@@ -386,7 +412,9 @@ def _fields(text: str) -> Iterator[tuple[int, str, list[str]]]:
     if separator is None and not re.search(r"\d,\d+[ ]+-?\d+,\d", sample):
         separator = ","
     for number, line in enumerate(lines, 1):
-        bare = re.sub(r"^\s*p?[\[({]+|[\])}]+\s*,?\s*$", "", line.strip()).lstrip("#").strip()
+        bare = (
+            re.sub(r"^\s*(?:\w+\s*:?=\s*)?p?[\[({]+|[\])}]+\s*,?\s*$", "", line.strip()).lstrip("#").strip()
+        )
         if separator is None or (separator == "," and "," not in bare):
             fields = bare.split()
         else:
@@ -406,7 +434,10 @@ def _labelled(line: str) -> list[tuple[str, float]]:
     """Pairs of name and number of KUKA's ``{X 10.0, Y 5.0, Z 0, A 90, B 0, C 180}``; empty where it is none."""
     found = re.findall(r"\b([A-Za-z]\w*)\s*[:= ]\s*(-?\d[\d.]*(?:[eE][-+]?\d+)?)", line)
     pairs = [(ALIASES.get(k.lower(), k.lower()), float(v)) for k, v in found]
-    return pairs if {"x", "y", "z"} <= {k for k, _ in pairs} else []
+    names = {k for k, _ in pairs}
+    if {"a", "b", "c"} <= names:  # KUKA's S and T say how the joints stand
+        pairs = [(k, v) for k, v in pairs if k not in {"s", "t"}]
+    return pairs if {"x", "y", "z"} <= names else []
 
 
 def _numbers(fields: Sequence[str]) -> list[float] | None:
@@ -442,6 +473,10 @@ def _column(field: str) -> str:
 
 def _by_columns(table: Float64, names: list[str], where: str) -> Readings:
     if not names or len(names) != table.shape[1]:
+        if (
+            table.shape[1] == 9 and _unit(table[:, 5:]) and (table[:, :2] % 1 == 0).all()
+        ):  # seconds and nanoseconds
+            table = np.c_[table[:, 0] + 1e-9 * table[:, 1], table[:, 2:]]
         width = table.shape[1]
         timed = width in {8, 13, 17} or (
             width == 7 and not _unit(table[:, 3:]) and bool((np.diff(table[:, 0]) > 0).all())
