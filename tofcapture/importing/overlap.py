@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.errors import DataError
 from tofcapture.frames import NO_TRUTH, View
 from tofcapture.importing.rules import Float32, sign_unknown
 from tofcapture.importing.truth import nearest
 from tofcapture.ops.phase import Decoder
 from tofcapture.poses import Float64, transform_points
-from tofcapture.rig import SPEED_OF_LIGHT
 
 _WRONG = 0.03  # m of median difference from which a better reading is looked for
 _BETTER = 3.0  # times smaller differences of another reading
