@@ -5,16 +5,19 @@
 
 Datasets are made by what stands behind `tofcapture simulate-dataset`, with the overrides of ``[sim]`` that a row names, and answered
 by the public ``Predictor``. Rows that differ in the electronics alone expose the same rendered light, so that a second network is
-scored in minutes. Each scene has a calibration of its own. Every number is over the pixels of objects, 4 mm above the table and
-more; in the rows ``wall`` over all, in ``empty table`` over the table.
+scored in minutes. What is rendered is kept: name another folder for other meshes or views, or after the simulator changed. Each scene
+has a calibration of its own. Every number is over the pixels of objects, 4 mm above the table and more; in the rows ``wall`` over all,
+in ``empty table`` over the table.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import shutil
 import time
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -26,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 
 from tofcapture.cli.kit import progress
-from tofcapture.devices.sim import hashed_generator
+from tofcapture.devices.sim import hashed_generator, sensor
 from tofcapture.devices.sim.config import Constants, read_constants
 from tofcapture.devices.sim.light import Light, light_at_pixels
 from tofcapture.devices.sim.scene import Caster, merge
@@ -39,18 +42,21 @@ from tofcapture.files.seal import replacing, sha256_of, write_text
 from tofcapture.files.shard import ShardReader
 from tofcapture.frames import StereoFrame, TofInfo
 from tofcapture.meshes import cuboid
+from tofcapture.ops import phase
 from tofcapture.ops.phase import frequencies
 from tofcapture.poses import Float64, look_at, transform_points
 from tofcapture.suites import capture
 from tofcapture.suites.capture import layered
-from tofcapture.suites.make import DatasetSpec, finished, make_one
-from tofcapture.suites.run import simulate_dataset
+from tofcapture.suites.make import DatasetSpec, make_one, paths
 from tofcapture.suites.scene import Poses, Recipe, Scene
 from tofcapture.suites.tabletop import table_meshes
 from tofcapture_model.data import batched, make_frame, make_target
 from tofcapture_model.data.raw_input import from_arrays
 from tofcapture_model.evaluation.objects import Support, Tally, classes, tally
+from tofcapture_model.frame import Target
+from tofcapture_model.geometry.maps import intrinsics_of
 from tofcapture_model.inference.predict import Predictor
+from tofcapture_model.networks import baselines
 from tofcapture_model.networks.baselines import sensor_estimate
 from tofcapture_model.networks.checkpoint import find_model
 
@@ -191,7 +197,7 @@ ROWS: dict[str, Row] = {
     "white room": Row(light="white"),
 }
 PIXELS: dict[str, Row] = {
-    "saturated pixels": Row(sim=_sensor(signal=[2240.0]), spoil=_saturated, pixels="good"),
+    "saturated pixels": Row(sim=_sensor(signal=[5600.0]), spoil=_saturated, pixels="good"),
     "dark pixels": Row(sim=_sensor(signal=[5.6]), spoil=_dark),
     "stuck pixels": Row(spoil=_stuck, pixels="good"),
     "dead pixels": Row(spoil=_dead, pixels="good"),
@@ -365,16 +371,21 @@ def render(args: argparse.Namespace) -> None:
                     _make(spec, args.folder / name, index)
     finally:
         capture.SimWorld, capture.plan_views = own  # type: ignore[misc]
-    with progress() as report:
-        for name, spec in specs.items():
-            simulate_dataset(spec, args.folder / name, 1, split="test")
-        if args.cameras:
-            drawn = DatasetSpec(seed=CAMERA_SEED, scenes=max(args.scenes, CAMERAS), cameras=CAMERAS, **same)
-            simulate_dataset(drawn, args.folder / "cameras", 1, lambda a, b: report("cameras", a, b), "test")
+    if args.cameras:
+        drawn = DatasetSpec(seed=CAMERA_SEED, scenes=max(args.scenes, CAMERAS), cameras=CAMERAS, **same)
+        with progress() as report:
+            for index in range(drawn.scenes):
+                report("cameras", index, drawn.scenes)
+                if not _there(drawn, args.folder / "cameras", index):
+                    make_one(drawn, args.folder / "cameras", index)
+
+
+def _there(spec: DatasetSpec, out: Path, index: int) -> bool:
+    return paths(out, spec.scene(index).name)[2].is_file()
 
 
 def _make(spec: ShiftSpec, out: Path, index: int) -> None:
-    if finished(spec, out, index, spec.scene(index).name) is None:
+    if not _there(spec, out, index):
         _World.keep, _World.stand, _World.taken = out, spec.stand, 0
         shutil.rmtree(
             out / "simulation" / f"{spec.scene(index).name}.work", ignore_errors=True
@@ -416,6 +427,16 @@ Measured = dict[str, Any]
 """``scene``, ``view``, ``camera``, tallies of ``sensor`` and ``network``, ``unmeasured``: pixels that the network says were not measured."""
 
 
+def sensors(raw: Raw, info: TofInfo, row: Row) -> tuple[torch.Tensor, torch.Tensor]:
+    """Answer as the sensor does: depth and normals."""
+    camera = info.camera
+    if row.plain:
+        data = from_arrays({"raw": raw}, Path("array"), frame=0)
+        info, camera = data.info, data.camera
+    depth, normals, _ = sensor_estimate(batched(make_frame(raw.astype(float), info, camera)))
+    return depth, normals
+
+
 def measure(
     predictor: Predictor,
     shard: ShardReader,
@@ -423,38 +444,34 @@ def measure(
     raw: Raw,
     info: TofInfo,
     row: Row,
-    bad: NDArray[np.bool_] | None,
+    known: dict[str, Any],
 ) -> Measured:
-    """Answer one view, by the sensor and by the network."""
-    if row.plain:
-        data = from_arrays({"raw": raw}, Path("array"), frame=0)
-        found, frame = predictor(raw), make_frame(raw.astype(float), data.info, data.camera)
-    else:
-        found, frame = predictor(raw, info), make_frame(raw.astype(float), info, info.camera)
-    frame = batched(frame)
-    depth, normals, _ = sensor_estimate(frame)
-    gt = shard.ground_truth(view, 2)
-    target = type(t := make_target(gt.depth, gt.normals, gt.mask))(*(x[None] for x in t))
-    T = shard.T_base_tof(view)
-    table = Support(torch.from_numpy(T[2, :3].copy()), float(TABLE_CENTRE[2] - T[2, 3]), 0.0)
-    truth_rays = (
-        batched(make_frame(raw.astype(float), info, info.camera)).intrinsics
-        if row.plain
-        else frame.intrinsics
+    """Answer one view, by the sensor, unless ``known`` has what that leads to, and by the network."""
+    bad = (
+        row.spoil(raw, info, hashed_generator(f"spoil|{shard.scene}|{view}".encode())) if row.spoil else None
     )
-    masks = {**classes(target, truth_rays, table), "good": target.good}
-    mask = masks[row.pixels]
+    found = predictor(raw) if row.plain else predictor(raw, info)
+    gt, T = shard.ground_truth(view, 2), shard.T_base_tof(view)
+    target = Target(*(x[None] for x in make_target(gt.depth, gt.normals, gt.mask)))
+    plane = Support(torch.from_numpy(T[2, :3].copy()), float(TABLE_CENTRE[2] - T[2, 3]), 0.0)
+    mask = {**classes(target, intrinsics_of(info.camera)[None], plane), "good": target.good}[row.pixels]
     if bad is not None:
         mask = mask & torch.from_numpy(bad.repeat(2, 0).repeat(2, 1))[None, None]
+    key = f"{shard.scene}|{view}"
+    if key not in known:
+        known[key] = asdict(tally(*sensors(raw, info, row), None, target, mask))
 
     def image(x: NDArray[Any]) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(x)).float()[None]
 
     error = None if found.error is None else image(found.error)[None]
-    measured = torch.from_numpy(found.measured)[None, None]
     ours = image(found.depth)[None], image(found.normals.transpose(2, 0, 1)), error
+    measured = torch.from_numpy(found.measured)[None, None]
     return {
-        "sensor": asdict(tally(depth, normals, None, target, mask)),
+        "scene": shard.scene,
+        "view": view,
+        "camera": info.serial,
+        "sensor": known[key],
         "network": asdict(tally(*ours, target, mask)),
         "trusted": asdict(tally(*ours, target, mask & measured)),
         "farthest": float(np.nanmax(found.depth)),
@@ -462,33 +479,36 @@ def measure(
 
 
 def score(args: argparse.Namespace) -> dict[str, list[Measured]]:
-    """Measure every row on every view."""
+    """Measure every row on every view; what the sensor makes of them is kept for the next network."""
     predictor, out = Predictor(args.weights), {}
-    rows = chosen(args)
+    rows = chosen(args) | ({"cameras": Row("cameras")} if args.cameras else {})
     with progress() as report, torch.inference_mode():
         for k, (name, row) in enumerate(rows.items()):
-            report("rows", k, len(rows) + args.cameras, name)
+            report("rows", k, len(rows), name)
+            kept = args.folder / "sensor" / f"{_digest(row)}.json"
+            known: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else {}
             out[name] = []
-            for number, path in enumerate(
-                sorted((args.folder / row.stand / "shards").glob("*.h5"))[: args.scenes]
-            ):
+            for path in sorted((args.folder / row.stand / "shards").glob("*.h5")):
                 with ShardReader(path) as shard:
+                    number = zlib.crc32(shard.scene.encode()) % 1000  # of its calibration
                     for view in range(min(shard.views, args.views)):
-                        raw, info = exposed(args.folder, row, shard.scene, view, number)
-                        rng = hashed_generator(f"spoil|{shard.scene}|{view}".encode())
-                        bad = row.spoil(raw, info, rng) if row.spoil else None
-                        found = measure(predictor, shard, view, raw, info, row, bad)
-                        out[name].append({"scene": shard.scene, "view": view, "camera": number, **found})
-        if args.cameras:
-            report("rows", len(rows), len(rows) + 1, "cameras")
-            out["cameras"] = []
-            for path in sorted((args.folder / "cameras" / "shards").glob("*.h5")):
-                with ShardReader(path) as shard:
-                    for view in range(shard.views):
-                        found = measure(predictor, shard, view, shard.raw(view, 0), shard.info, Row(), None)
-                        serial = shard.info.serial
-                        out["cameras"].append({"scene": shard.scene, "view": view, "camera": serial, **found})
-    return out
+                        if name == "cameras":
+                            raw, info = shard.raw(view, 0), replace(shard.info, camera=shard.camera)
+                        else:
+                            raw, info = exposed(args.folder, row, shard.scene, view, number)
+                        out[name].append(measure(predictor, shard, view, raw, info, row, known))
+            kept.parent.mkdir(exist_ok=True)
+            write_text(kept, json.dumps(known))
+    return {name: found for name, found in out.items() if any(r["network"]["pixels"] for r in found)}
+
+
+def _digest(row: Row) -> str:
+    """Digest what the sensor's answer depends on besides the light: the row, the electronics and the decoder."""
+    told = repr(replace(row, spoil=None)) + getattr(row.spoil, "__name__", "")
+    sources = [Path(str(sensor.__file__)), Path(str(baselines.__file__))]
+    sources += sorted(Path(str(phase.__file__)).parent.glob("*.py"))
+    code = [path.read_bytes() for path in sources]
+    return hashlib.sha256(b"".join([told.encode(), *code])).hexdigest()[:16]
 
 
 def _pooled(rows: Sequence[Measured], who: str) -> Tally:
@@ -588,13 +608,15 @@ def main() -> None:
         metavar="ROW",
         help="these rows; the drawn cameras are called cameras",
     )
+    add("--score-only", action="store_true", help="what is rendered already")
     add("--threads", type=int, default=0, help="of PyTorch (default: as many as it takes)")
     args = parser.parse_args()
     args.cameras = not args.only or "cameras" in args.only
     if args.threads:
         torch.set_num_threads(args.threads)
     begun = time.monotonic()
-    render(args)
+    if not args.score_only:
+        render(args)
     rendered = time.monotonic()
     found = score(args)
     digest = sha256_of(find_model(args.weights))[:12]
