@@ -38,6 +38,7 @@ from tofcapture.devices.sim.sensor import expose
 from tofcapture.devices.sim.transport import Lamp, Transport
 from tofcapture.devices.sim.world import SimWorld
 from tofcapture.devices.station import read_station
+from tofcapture.files.manifest import manifest_path
 from tofcapture.files.seal import replacing, sha256_of, write_text
 from tofcapture.files.shard import ShardReader
 from tofcapture.frames import StereoFrame, TofInfo
@@ -48,6 +49,7 @@ from tofcapture.poses import Float64, look_at, transform_points
 from tofcapture.suites import capture
 from tofcapture.suites.capture import layered
 from tofcapture.suites.make import DatasetSpec, make_one, paths
+from tofcapture.suites.run import simulate_dataset
 from tofcapture.suites.scene import Poses, Recipe, Scene
 from tofcapture.suites.tabletop import table_meshes
 from tofcapture_model.data import batched, make_frame, make_target
@@ -74,7 +76,7 @@ _QUARTERS, _THIRDS = (0.0, PI / 2, PI, 3 * PI / 2), (0.0, 2 * PI / 3, 4 * PI / 3
 
 def _tof(width: int = 240, height: int = 180, degrees: float = 0.0, *lens: float) -> dict[str, Any]:
     """Make a ``[tof]`` of another size or field of view than the default's, in the middle of the image."""
-    focal = width / 2 / np.tan(np.radians(degrees) / 2) if degrees else 195.0 * width / 240
+    focal = float(width / 2 / np.tan(np.radians(degrees) / 2)) if degrees else 195.0 * width / 240
     centre = {"cx": (width - 1) / 2, "cy": (height - 1) / 2}
     return {"width": width, "height": height, "fx": focal, "fy": focal, "distortion": list(lens), **centre}
 
@@ -378,6 +380,8 @@ def render(args: argparse.Namespace) -> None:
                 report("cameras", index, drawn.scenes)
                 if not _there(drawn, args.folder / "cameras", index):
                     make_one(drawn, args.folder / "cameras", index)
+        if not manifest_path(args.folder / "cameras").is_file():  # for `tofcapture evaluate`
+            simulate_dataset(drawn, args.folder / "cameras", 1, split="test")
 
 
 def _there(spec: DatasetSpec, out: Path, index: int) -> bool:

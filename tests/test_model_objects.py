@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import shifts
+from tofcapture.channels import frequencies, unambiguous
+from tofcapture.devices.sim.config import read_constants
 from tofcapture.poses import rotation_exp
+from tofcapture.suites.capture import layered
 from tofcapture_model.evaluation.objects import (
     HEIGHT,
     Objects,
@@ -20,7 +24,7 @@ from tofcapture_model.evaluation.objects import (
     told,
 )
 from tofcapture_model.frame import Target
-from tofcapture_model.geometry.maps import rays, scale_intrinsics
+from tofcapture_model.geometry.maps import expect_usable, rays, scale_intrinsics
 
 H, W = 45, 60
 INTRINSICS = torch.tensor([[48.0, 50.0, 29.0, 22.0]])
@@ -137,3 +141,37 @@ def test_the_worst_object_and_the_worst_camera_are_named():
     assert table["cameras"]["camera 1"]["model"]["within_sigma"] == 1
     assert any("s0" in line for line in told(table))
     assert spread({}) == {}
+
+
+def test_every_shift_is_a_camera_that_can_be_simulated_and_decoded():
+    """Constants are read, channels decode, lenses unfold; the light that is kept has all frequencies that rows ask for."""
+    for name, row in {**shifts.ROWS, **shifts.PIXELS}.items():
+        sim = layered(shifts.station_sim(), shifts.STANDS[row.stand].sim, row.sim)
+        constants = read_constants(sim, name)
+        assert set(constants.sensor.modulation_hz) <= set(
+            shifts.HZ if row.stand == "base" else shifts.PAPER_HZ
+        )
+        expect_usable(constants.tof)
+        assert unambiguous(frequencies(constants.sensor.modulation_hz)) > 2, name
+
+
+def test_the_table_of_shifts_begins_with_the_worst_and_names_camera_and_object():
+    """A row that is worse than the sensor is the first; rows of drawn cameras are told one by one."""
+
+    def row(scene, camera, error):
+        told = {"wanted": 10, "pixels": 10, "square": 1.0, "angle": 1.0, "told": 10, "inside": 7}
+        return {
+            "scene": scene, "view": 0, "camera": camera, "farthest": 1.0, "sensor": {**told, "error": 0.1},
+            "network": {**told, "error": error}, "trusted": {**told, "error": error},
+        }  # fmt: skip
+
+    found = {
+        "as trained": [row("a", 1, 0.03)],
+        "wall": [row("a", 1, 0.2)],
+        "60 MHz alone": [row("a", 1, 0.1)],
+    }
+    lines = shifts.table(found | {"cameras": [row("a", "left", 0.03), row("b", "right", 0.05)]}).splitlines()
+    assert [line.split("  ")[0] for line in lines[2:5]] == ["wall", "60 MHz alone", "as trained"]
+    assert "2.00" in lines[2]
+    assert sum(line.startswith(("left", "right")) for line in lines) == 2
+    assert any("worst 0.50" in line for line in lines)
