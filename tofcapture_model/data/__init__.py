@@ -206,6 +206,8 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         Decoded frames and their ground truth are kept in memory up to this size.
     cache
         Folder that ``tofcapture pack`` filled with this split of the one dataset; ``None`` reads the shards.
+    batches
+        Frames are to make batches, and so must be alike; one by one they may be of any cameras.
     """
 
     def __init__(
@@ -220,6 +222,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         mean: bool = False,
         cache_bytes: float = 0,
         cache: Path | None = None,
+        batches: bool = True,
     ) -> None:
         folders = [Path(folder)] if isinstance(folder, str | Path) else [Path(each) for each in folder]
         if cache and len(folders) > 1:
@@ -238,7 +241,8 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
                 hint="record more scenes, or choose another --split",
             )
         self.size, self.flip, self.seed, self.mean = tuple(size), flip, seed, mean
-        _expect_alike(self.readers, self.size)
+        if batches:
+            _expect_alike(self.readers, self.size)
         least = min(reader.frames for reader in self.readers.values())
         self.averaged = min(least, frames or least) if mean else 1  # frames of an item
         self.samples = [
