@@ -26,7 +26,8 @@ myst_heading_anchors = 3
 napoleon_google_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
-autodoc_typehints = "none"  # signatures already carry them, and the docstrings say shapes and units
+autodoc_typehints = "signature"  # the docstrings say shapes and units
+python_use_unqualified_type_names = True
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 # What the reference imports must not need: the libraries of the extras.
@@ -53,7 +54,9 @@ def _escape(_app: object, _what: str, _name: str, _thing: object, _options: obje
     """In our docstrings ``|x|`` is a length or a number's size, never reStructuredText's substitution."""
     for i, line in enumerate(lines):
         parts = re.split(r"(``.*?``)", line)
-        lines[i] = "".join(p if p.startswith("``") else p.replace("|", r"\|") for p in parts)
+        plain = "".join(p if p.startswith("``") else p.replace("|", r"\|") for p in parts)
+        # ``low, high`` are two names; Sphinx would take the first for the type of the second.
+        lines[i] = re.sub(r"^:(?:ivar|param) [\w, ]+:", lambda field: field[0].replace(", ", ","), plain)
 
 
 def _inside(_app: object, name: str, source: list[str]) -> None:

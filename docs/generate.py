@@ -48,7 +48,7 @@ def commands_page() -> str:
         "",
         "Every command has `--help` and `--json`; results go to stdout, progress and errors to stderr.",
         "",
-        EXIT_CODES + ".",
+        EXIT_CODES[0].upper() + EXIT_CODES[1:] + ".",
         "",
     ]
     for title, names in GROUPS.items():
@@ -93,7 +93,8 @@ def api_pages() -> dict[str, str]:
         pages[f"api-{package}.md"] = "\n".join(lines)
         for name in names:
             body = f"```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n```\n"
-            pages[f"api/{name}.md"] = f"# {name}\n\n{body}"
+            title = name.replace(".", ".\u200b")  # a narrow page breaks it there
+            pages[f"api/{name}.md"] = f"# {title}\n\n{body}"
     return pages
 
 

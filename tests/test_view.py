@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from tests import PATIENCE, pictures, until
 from tests.test_files_shard import RIG, write
 from tofcapture.cli import main
-from tofcapture.colours import GOOD, GREY, MASK, Scale, palette, scale_for
+from tofcapture.colours import _LADDER, GOOD, GREY, MASK, Scale, palette, scale_for
 from tofcapture.errors import DeviceError
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.manifest import Manifest, SceneEntry, write_manifest
@@ -136,7 +136,17 @@ def test_a_scale_spans_its_colours(low, span, gamma):
     scale = Scale("viridis", low, low + span, "mm", gamma)
     values = np.array([[low, low + span, low - 1, low + span + 1, np.nan]])
     assert scale.indices(values).tolist() == [[0, 254, 0, 254, 255]]
-    assert len(scale.ticks) == 5
+    assert [float(scale.ticks[i]) for i in (0, -1)] == pytest.approx([low, low + span], rel=1e-4, abs=1e-6)
+
+
+def test_numbers_along_a_scale_are_round():
+    """Ends of scales come from a ladder, and so do the numbers between them; a signed scale has its zero."""
+    assert Scale("magma", 0, 1.5, "mm").ticks == ["0", "0.5", "1", "1.5"]
+    assert Scale("RdBu_r", -7.5, 7.5, "mm").ticks == ["-7.5", "-5", "-2.5", "0", "2.5", "5", "7.5"]
+    assert Scale("cividis", 0, 750, "raw units", 0.5).ticks == ["0", "30", "120", "270", "480", "750"]
+    assert Scale("viridis", 0.26, 0.52, "m").ticks == ["0.26", "0.39", "0.52"]
+    for end in _LADDER:
+        assert "0" in Scale("RdBu_r", -end, end, "mm").ticks
 
 
 def test_the_depth_scale_shows_the_object():

@@ -93,15 +93,22 @@ class Scale:
 
     @property
     def ticks(self) -> list[str]:
-        """Five numbers along the scale as text."""
-        values = self.low + np.linspace(0, 1, 5) ** (1 / self.gamma) * (self.high - self.low)
-        digits = max(0, int(np.ceil(1.5 - np.log10(max(self.high - self.low, 1e-9)))))
-        return [f"{v:.{digits}f}" for v in values]
+        """Numbers at equal ways along the scale as text, its ends among them: as many as make them round."""
+        span = max(self.high - self.low, 1e-9)
+        counts = (5, 7, 3) if self.low < 0 else (5, 6, 4, 3)
+        count = next((n for n in counts if _is_round(span / (n - 1))), 3) if self.gamma == 1 else 6
+        values = self.low + np.linspace(0, 1, count) ** (1 / self.gamma) * span
+        return [f"{round(v, 6):.6g}" for v in values]
 
     @property
     def words(self) -> str:
         """Both ends with their unit."""
         return f"{self.low:.3g} to {self.high:.3g} {self.unit}"
+
+
+def _is_round(step: float) -> bool:
+    """Say whether it is 1, 2, 2.5 or 5 times a power of ten."""
+    return bool(np.isclose(step / 10 ** np.floor(np.log10(step) + 1e-9), [1, 2, 2.5, 5]).any())
 
 
 @lru_cache
@@ -118,7 +125,7 @@ def scale_for(
 ) -> Scale:
     """Choose the scale that images (H, W) of one kind share; NaN: none.
 
-    Depth shows the object: 1 to 99 percent of it with a fifth of that beside it. ``objects`` say where it is in the first
+    Depth shows the object: 1 to 99 percent of it with a fifth of that beside it, in whole centimetres. ``objects`` say where it is in the first
     images. Where no object is known, depth covers 2 to 75 percent of everything, which leaves out what is far behind. Errors
     end at round numbers above 95 percent, signed ones symmetric about 0; amplitude at one above 99 percent.
     """
@@ -133,7 +140,9 @@ def scale_for(
         low, high = low - 0.2 * (high - low), high + 0.2 * (high - low)
     else:
         low, high = percentile(images, 2, 0.0), percentile(images, 75, 1.0)
-    return Scale(colours, low, max(high, low + 1e-3), unit or usual, gamma)
+    step = 10.0 if unit == "mm" else 0.01
+    low, high = step * np.floor(low / step), step * np.ceil(max(high, low + 1e-3) / step)
+    return Scale(colours, round(float(low), 6), round(float(high), 6), unit or usual, gamma)
 
 
 def paint_normals(normals: NDArray[Any]) -> UInt8:

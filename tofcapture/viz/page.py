@@ -331,15 +331,16 @@ def draw_rig(axes: Any, rig: Rig, across: int, along: int) -> None:
     flange = 1e3 * T_tof_flange[:3, 3]
     for arm in 20 * T_tof_flange[:3, :3].T:
         axes.plot(*np.stack([flange, flange + arm])[:, shown].T, color=FLANGE, lw=2)
-    labels = [("flange", flange, FLANGE)]
+    labels = [("flange", flange, FLANGE, "center")]
+    right = rig.T_tof_stereo[across, 3] > 0  # the stereo camera's name stands on its own side
     for name, T, camera, colour in (
         ("ToF", np.eye(4), rig.tof, TOF),
         ("stereo", rig.T_tof_stereo, rig.stereo, STEREO),
     ):
         drawn = 1e3 * transform_points(T, frustum(camera))
         axes.plot(*drawn[:, shown].T, color=colour, lw=1.5)
-        labels.append((name, drawn[0], colour))
-    for name, at, colour in labels:
+        labels.append((name, drawn[0], colour, "left" if right == (name == "stereo") else "right"))
+    for name, at, colour, side in labels:
         axes.annotate(
             name,
             at[shown],
@@ -347,10 +348,10 @@ def draw_rig(axes: Any, rig: Rig, across: int, along: int) -> None:
             textcoords="offset points",
             color=colour,
             fontsize=8,
-            ha="center",
+            ha=side,
         )
     axes.set_xlabel(f"{'xyz'[across]}, ToF frame (mm)")
     axes.set_ylabel(f"{'xyz'[along]} (mm)")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.1, 0.2)
+    axes.margins(0.2, 0.3)  # room for the names
     axes.grid(alpha=0.3)

@@ -174,7 +174,7 @@ def _cell(shot: Shot, panel: Panel, shared: Mapping[str, Scale]) -> Cell:
     if panel.kind != "depth":
         return Cell(panel.paint(shared.get(panel.kind)), shared.get(panel.kind))
     scale = scales_of(shot.panels)["depth"]
-    return Cell(panel.paint(scale), scale, f"{scale.low:.2f} to {scale.high:.2f} m")
+    return Cell(panel.paint(scale), scale, scale.words)
 
 
 def _calibration(figure: Any, source: Source) -> None:

@@ -53,6 +53,16 @@ def write_stats_page(stats: DatasetStats, path: Path) -> Path:
     return write_page(Path(__file__).with_name("stats.html.j2"), path, content)
 
 
+# What axes say of a quantity, and its unit there in its unit in files: errors are millimetres wherever people look.
+_AXES = {
+    "gt_depth": ("ground truth depth, m", 1.0),
+    "tof_depth": ("ToF depth, m", 1.0),
+    "tof_minus_gt": ("ToF - ground truth, mm", 1e3),
+    "amplitude": ("amplitude, raw units", 1.0),
+    "celsius": ("temperature, degrees Celsius", 1.0),
+}
+
+
 def quantity_rows(stats: DatasetStats) -> list[list[str]]:
     """Rows of quantity, split, count, min, 1 %, median, 99 %, max."""
     rows = []
@@ -100,9 +110,11 @@ def _histogram(stats: DatasetStats, quantity: Quantity) -> str:
     step = (quantity.high - quantity.low) / len(centres)
     span = (low * 0.8, high * 1.2) if quantity.log else (low - 3 * step, high + 3 * step)
     shares = {name: (centres, t.counts / t.counts.sum()) for name, t in found.items()}
-    x = f"{quantity.name} [{quantity.unit}]"
+    words, times = _AXES.get(quantity.name, (f"{quantity.name}, {quantity.unit}", 1.0))
+    shares = {name: (times * at, share) for name, (at, share) in shares.items()}
+    span = (times * span[0], times * span[1])
     return lines(
-        shares, x, "share", f"distribution of {quantity.name}", log="x" if quantity.log else "", span=span
+        shares, words, "share", f"distribution of {quantity.name}", log="x" if quantity.log else "", span=span
     )
 
 

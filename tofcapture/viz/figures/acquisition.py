@@ -107,9 +107,9 @@ def _draw_space(figure: Any, poses: Sequence[Any], chosen: int, rig: Rig, shot: 
 
 
 def _draw_panels(figure: Any, shots: Sequence[Shot]) -> None:
-    """Draw amplitude, ToF depth and stereo depth, a row for each shot; all rows share their scales."""
+    """Draw amplitude, ToF depth and stereo depth, a row for each shot; depth on a scale of its row's own."""
     rows = [shot.panels[:3] for shot in shots]
-    scales = scales_of([panel for row in rows for panel in row])
+    shared = scales_of([panel for row in rows for panel in row])["amplitude"]
     aspects = [p.values.shape[1] / p.values.shape[0] for p in rows[0]]
     tall = (WIDTH - _LEFT - 0.1 - 2 * _GAP) / sum(aspects)  # all columns are of one height
     lefts = _LEFT + np.concatenate([[0], np.cumsum([a * tall + _GAP for a in aspects])])
@@ -118,16 +118,14 @@ def _draw_panels(figure: Any, shots: Sequence[Shot]) -> None:
         for c, panel in enumerate(row):
             box = (lefts[c] / WIDTH, bottom / _HEIGHT, aspects[c] * tall / WIDTH, tall / _HEIGHT)
             axes = figure.add_axes(box)
-            draw_cell(axes, Cell(panel.paint(scales[panel.kind])))
+            scale = shared if panel.kind == "amplitude" else scales_of(row)[panel.kind]
+            draw_cell(axes, Cell(panel.paint(scale), scale, "" if scale is shared else scale.words))
             if r == 0:
                 axes.set_title(panel.title, fontsize=SMALL, pad=3)
             if c == 0:
                 axes.set_ylabel(shot.name, fontsize=SMALL)
     low = (_HEIGHT - _HEAD - len(rows) * (tall + _GAP) - 0.2) / _HEIGHT
-    depth = "depth (m), each in its camera's frame; grey: none"
-    for kind, label, left, right in (
-        ("amplitude", "amplitude (raw units)", lefts[0], lefts[1]),
-        ("depth", depth, lefts[1], lefts[3]),
-    ):
-        box = ((left + 0.1) / WIDTH, low, (right - left - _GAP - 0.2) / WIDTH, 0.11 / _HEIGHT)
-        draw_bar(figure, box, scales[kind], label)
+    box = ((_LEFT + 0.1) / WIDTH, low, (lefts[1] - _LEFT - _GAP - 0.2) / WIDTH, 0.11 / _HEIGHT)
+    draw_bar(figure, box, shared, "amplitude (raw units)")
+    depth = "depth in each camera's frame: dark near, bright far; grey: none"
+    figure.text(lefts[1] / WIDTH, low, depth, fontsize=SMALL - 0.5)
