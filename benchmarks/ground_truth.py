@@ -1,6 +1,7 @@
 """Ground truth against the simulator's exact depth, per mask class, over scenes that are hard in different ways.
 
-    python benchmarks/ground_truth.py [--seed 0] [--scenes rods,dark,...] [--distances 0.45,0.8,1.4]
+    python -m benchmarks.ground_truth [--seed 0] [--scenes rods,dark,...] [--distances 0.45,0.8,1.4]
+    python -m benchmarks.ground_truth --fused 25 [--seed 0] [--scenes mug,...]
 
 Every scene is seen by cameras of full size with all of the stereo camera's errors, from three directions, with the true rig,
 so that the figures are those of denoising, projection, normals and crop alone. Printed per scene and for all: median and 99th
@@ -10,30 +11,47 @@ pixels with depth that carry that bit), the share of wrong pixels (more than 2 m
 
 Then what denoising removes, of points of the stereo camera that are wrong (2 mm and 0.4 % off) and of those that are right:
 ours, and Open3D's statistical and radius outlier removal.
+
+``--fused N`` compares the truth of single views with that of all together: N views of each scene as the default station plans
+them, built twice, with exact poses and with an arm that repeats to 0.1 mm (and 0.1 mrad) beside a hand-eye transform that is
+0.5 mm and 0.1 degrees off. Asked for are the object's pixels that any stereo view measured, real depth edges apart; by class: rim
+(within 4 ToF pixels of an edge), shadow (not hit or occluded for the own stereo camera), hollow (0.5 mm deeper than 8 pixels
+about it), flat (the rest).
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from tofcapture.dataset.build import build_dataset
 from tofcapture.dataset.sample import SampleConfig, decoder_for, make_sample
+from tofcapture.devices.clearance import workcell_of
+from tofcapture.devices.kinematics import arm_model
 from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.scene import SceneObject
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
 from tofcapture.devices.sim.shapes import board
 from tofcapture.devices.sim.stereo import ideal
 from tofcapture.devices.sim.world import SimWorld
+from tofcapture.devices.station import read_station
 from tofcapture.files.layout import MaskBit
-from tofcapture.files.shard import GroundTruth
+from tofcapture.files.shard import GroundTruth, ShardReader
+from tofcapture.files.view import open_view, view_path, write_view
 from tofcapture.frames import ArmState, Truth, View
 from tofcapture.libraries import load_open3d
 from tofcapture.meshes import Mesh, cuboid, move
 from tofcapture.ops.denoise import denoise
-from tofcapture.poses import exp, invert, look_at, transform
+from tofcapture.ops.project import edges
+from tofcapture.poses import Float64, exp, invert, look_at, transform, transform_points
+from tofcapture.record.plan import object_sampling, plan_views
+from tofcapture.rig import dumps_rig
 
 FAST = {"render": {"multipath": False, "subpixels": 1}}  # the ToF camera's light is no matter here
 DISTANCES = (0.45, 0.8, 1.4)
@@ -41,6 +59,8 @@ DIRECTIONS = ((0.0, 0.3), (0.7, 0.2), (-0.5, -0.6))  # x and y per unit of heigh
 
 
 WRONG = 0.002  # m; a pixel whose depth is off by more is wrong
+ARM = np.repeat([1e-4, 1e-4], 3)  # m, rad; standard deviations of a pose of a bad arm
+HAND_EYE = exp([3e-4, -3e-4, 2.6e-4, 1e-3, -1e-3, 1e-3])  # half a millimetre and a tenth of a degree
 THROUGH = 0.005  # m; a pixel whose depth lies this far behind the truth shows what is behind it
 
 
@@ -227,6 +247,126 @@ def removals(view: View, exact: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
+def planned(name: str, seed: int, views: int, folder: Path) -> None:
+    """Record a scene as the default station would, with exact poses and the true rig."""
+    world = SimWorld(read_constants(FAST, "benchmark"), seed, objects)
+    workcell, model = workcell_of(read_station(None)), arm_model("ur10e")
+    rng = np.random.default_rng(seed)
+    plan = plan_views(model, world.nominal_rig(), workcell, workcell.target, object_sampling(), views, rng)
+    world.place(name)
+    for view in plan.views:
+        world.set_pose(view.T_base_flange, bytes([view.index]))
+        now = iter(range(1, 10**12, 10**6)).__next__
+        state = ArmState(view.joints, view.T_base_flange, 1)
+        burst, stereo = world.tof(1, now), world.stereo(now)
+        taken = View(name, view.index, burst, stereo, state, state, world.true_rig, {}, world.truth())
+        write_view(view_path(folder, name, view.index), taken)
+    (folder / "rig.toml").write_text(dumps_rig(world.true_rig))
+
+
+def disturbed(exact: Path, name: str, seed: int, folder: Path) -> None:
+    """Copy a recording; its arm and its hand-eye transform are off."""
+    rng = np.random.default_rng(seed)
+    for path in sorted((exact / "views" / name).glob("view-*.h5")):
+        view = open_view(path)
+        said = view.arm_before.T_base_flange @ exp(ARM * rng.standard_normal(6))
+        state = replace(view.arm_before, T_base_flange=said)
+        write_view(view_path(folder, name, view.index), replace(view, arm_before=state, arm_after=state))
+    rig = view.rig
+    (folder / "rig.toml").write_text(dumps_rig(replace(rig, T_flange_tof=rig.T_flange_tof @ HAND_EYE)))
+
+
+def asked(views: list[View], index: int) -> dict[str, np.ndarray]:
+    """Pixels (2H, 2W) of a view by class; ``all`` of them are the object's, measured by a view, and at no real edge."""
+    view, rig = views[index], views[index].rig
+    camera, depth = rig.tof.scaled(2), view.truth.depth.astype(float)
+    edge = edges(depth, camera, 2)
+    at = np.flatnonzero(view.truth.target & ~edge)
+    base = transform_points(
+        view.arm_before.T_base_flange @ rig.T_flange_tof, camera.unproject(depth).reshape(-1, 3)[at]
+    )
+    seen = np.zeros(len(at), dtype=bool)
+    for other in views:
+        p = transform_points(invert(other.arm_before.T_base_flange @ rig.T_flange_stereo), base)
+        at_other = np.nan_to_num(rig.stereo.project(p)[0], nan=-1.0)
+        inside = (
+            (p[:, 2] > 0)
+            & (at_other > 0).all(axis=1)
+            & (at_other < np.array(rig.stereo.shape[::-1]) - 1).all(axis=1)
+        )
+        u, v = np.rint(np.where(inside[:, None], at_other, 0)).astype(int).T
+        seen |= inside & (np.abs(other.stereo.points[v, u, 2] - p[:, 2]) < 0.002 + 0.004 * p[:, 2])
+    everything = np.zeros(depth.shape, dtype=bool)
+    everything.ravel()[at[seen]] = True
+    near = edges(depth, camera, 8)
+    about = np.stack([np.roll(depth, (8 * a, 8 * b), (0, 1)) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))])
+    hollow = depth - about.mean(axis=0) > 0.0005
+    return {"all": everything, "rim": everything & near, "hollow": everything & ~near & hollow,
+            "flat": everything & ~near & ~hollow}  # fmt: skip
+
+
+def compare(name: str, seed: int, count: int, folder: Path) -> None:
+    """Print single and fused truth of one scene, with exact poses and with bad ones."""
+    planned(name, seed, count, folder / "exact")
+    disturbed(folder / "exact", name, seed, folder / "off")
+    views = [open_view(p) for p in sorted((folder / "exact/views" / name).glob("view-*.h5"))]
+    classes = [asked(views, k) for k in range(len(views))]
+    single = build_dataset([folder / "exact"], folder / "single", config=SampleConfig(truth="single"), jobs=1)
+    for poses in ("exact", "off"):
+        start = time.process_time()
+        built = build_dataset(
+            [folder / poses], folder / f"fused-{poses}", config=SampleConfig(truth="fused"), jobs=1
+        )
+        seconds = (time.process_time() - start) / len(views)
+        print(f"{name}, {len(views)} views, poses {poses}: {seconds:.2f} s of CPU a view, "
+              f"{built.peak_memory / 2**30:.2f} GiB, alone: {dict(built.alone.get(name, {}))}")  # fmt: skip
+        _print(single.dataset / f"shards/{name}.h5", built.dataset / f"shards/{name}.h5", views, classes)
+
+
+def _print(single: Path, fused: Path, views: list[View], classes: list[dict[str, np.ndarray]]) -> None:
+    found: dict[str, list[Float64]] = {}
+    covers: list[tuple[float, float, float]] = []
+    through = 0
+    with ShardReader(single) as a, ShardReader(fused) as b:
+        for k, view in enumerate(views):
+            one, all_of_them = a.ground_truth(k, 2), b.ground_truth(k, 2)
+            good, was = all_of_them.mask == 0, one.mask == 0
+            error = np.nan_to_num(np.abs(all_of_them.depth - view.truth.depth), nan=np.inf)
+            through += int((good & (all_of_them.depth - view.truth.depth > THROUGH)).sum())
+            dark = (one.mask & (MaskBit.NOT_HIT | MaskBit.OCCLUDED)) > 0
+            asked_for = classes[k]["all"]
+            wanted, target = max(1, asked_for.sum()), view.truth.target
+            of_object = (was & target).sum() / max(1, target.sum())
+            covers.append(((asked_for & was).sum() / wanted, (asked_for & good).sum() / wanted, of_object))
+            parts = {
+                **classes[k],
+                "shadow": asked_for & dark,
+                "covered": was,
+                "added": ~was & view.truth.target,
+            }
+            for title, where in parts.items():
+                some = where & good
+                row = np.stack([error[some], error[some] / all_of_them.sigma[some], all_of_them.sigma[some]])
+                found.setdefault(title, []).append(row)
+                counts = found.setdefault(f"{title}#", [])
+                counts.append(np.array([where.sum(), (where & was).sum(), some.sum()], dtype=float))
+            alone = np.abs(one.depth - view.truth.depth)[was]
+            found.setdefault("single", []).append(np.stack([alone, alone, alone]))
+    cover = np.array(covers)
+    print(f"  of what was asked for: single {cover[:, 0].mean():.1%} (worst {cover[:, 0].min():.1%}), fused {cover[:, 1].mean():.1%} "
+          f"(worst {cover[:, 1].min():.1%}); single, of the whole object {cover[:, 2].mean():.1%}; seen through {through}")  # fmt: skip
+    for title in (t for t in found if not t.endswith("#")):
+        error, ratio, sigma = np.concatenate(found[title], axis=1)
+        if not len(error):
+            continue
+        counts = np.sum(found.get(f"{title}#", [np.array([np.nan] * 3)]), axis=0)
+        median, p99 = np.percentile(error, [50, 99], method="nearest") * 1e3
+        surest = np.argsort(sigma, kind="stable")[: len(sigma) // 2]
+        print(f"  {title:<8} {len(error):>8} px  single {counts[1] / counts[0]:6.1%} fused {counts[2] / counts[0]:6.1%}  median {median:6.4f} mm  "
+              f"p99 {p99:6.3f} mm  worst {1e3 * error.max():6.2f}  within one sigma {np.mean(ratio < 1):6.1%}  "
+              f"surer half: mean {1e3 * error[surest].mean():.4f} of {1e3 * error.mean():.4f} mm")  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -234,7 +374,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--distances", default=",".join(map(str, DISTANCES)))
+    parser.add_argument("--fused", type=int, metavar="N", help="views of each scene, built single and fused")
     args = parser.parse_args()
+    if args.fused:
+        for name in args.scenes.split(","):
+            with tempfile.TemporaryDirectory() as folder:
+                compare(name, args.seed, args.fused, Path(folder))
+        return
     distances = tuple(float(d) for d in args.distances.split(","))
     everything, crops, angles, removed = {}, [], [], {}
     for name in args.scenes.split(","):

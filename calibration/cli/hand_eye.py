@@ -201,7 +201,7 @@ def _hand_eye_table(result: HandEye, data: dict[str, Any]) -> str:
         lines += [f"  {who + ' clock':22}{'; '.join(words)}" for who, words in data["clocks"].items()]
     lines += [f"  rival reading         {words}" for words in data.get("rivals", ())]
     lines += [f"  FAIL: {text}" for text in data["failures"]]
-    if any(text.startswith("wrong target size") for text in result.failures):
+    if result.failures:
         lines.append("        (--target-scale free uses the size that fits, --target-scale 1 the given one)")
     return "\n".join(
         [*lines, *(f"  look: {text}" for text in data["warnings"]), f"verdict: {data['verdict']}"]

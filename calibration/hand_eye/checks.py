@@ -49,7 +49,6 @@ class Cause(StrEnum):
     MIRRORED = "mirrored axes"
     WRONG_UNITS = "wrong units"
     TARGET_SCALE = "wrong target size"
-    FOCAL_LENGTH = "wrong focal length"
     CONVENTION = "the meaning of the numbers cannot be told"
     TWO_BOARDS = "two boards confused"
     MOVED = "something was moved"

@@ -18,9 +18,6 @@ from tofcapture.poses import Float64
 FREEDOM = 8.0  # degrees of freedom of Student's t: efficient on Gaussian noise, and outliers lose their vote
 PRIOR = 12.0  # pairs' worth of belief that the camera's scatter is isotropic in each half
 FLOOR = (1e-7, 1e-7)  # m, rad; keeps noise-free data solvable
-STRETCHES = np.array(
-    [[1.0, 0.0], [1.0, 0.0], [1.0, 1.0]]
-)  # of x, y, z in the camera: the target's size, its depth
 ITERATIONS = 60
 STOP = 1e-8  # m, rad
 LEAST_LEFT = 0.02  # of a direction that only one group determines: its own residual tells nothing there
@@ -38,11 +35,10 @@ class Refined:
     residual: Float64  #: (N, 6) metres and radians, camera frame
     scatter: Float64  #: (N, 6, 6) covariance of each pair's noise
     #: (12, 12) of (t_X, phi_X, t_Z, phi_Z): metres, radians, rotations in the left tangent space.
-    #: (13, 13) or (14, 14) with the logarithms of ``scale`` and ``depth`` at the end where these were free
+    #: (13, 13) with the logarithm of ``scale`` at the end where that was free
     covariance: Float64
     left_out: Float64  #: (N, 6) residual of each pair under the solution without it; NaN where the rest determines nothing
     scale: float = 1.0  #: Factor by which the target's distances must be multiplied
-    depth: float = 1.0  #: Factor by which those along the camera's axis must be multiplied besides
 
     @property
     def noise(self) -> tuple[float, float]:
@@ -76,52 +72,46 @@ def refine(
     *,
     eye_to_hand: bool = False,
     free_scale: bool = False,
-    free_depth: bool = False,
 ) -> Refined:
-    """Refine X and Z by Gauss-Newton inside expectation-maximisation.
-
-    With ``free_scale`` the target's size is unknown too, with ``free_depth`` that and the camera's focal length.
+    """Refine X and Z, and with ``free_scale`` the target's size, by Gauss-Newton inside expectation-maximisation.
 
     P and B are (N, 4, 4) pairs, N >= 3; P is T_flange_base, not T_base_flange, where ``eye_to_hand``. X and Z are the start,
     (4, 4), ``noise`` is a first guess of the noise per axis, metres and radians.
     """
     whole = np.repeat(np.square(np.maximum(noise, FLOOR)), 3)
     camera, arm = np.diag(whole / 2), whole / 2
-    size, free = np.ones(3), 2 if free_depth else int(free_scale)
-    r, J = _linearised(P, B, X, Z, size, free)
+    scale = 1.0
+    r, J = _linearised(P, B, X, Z, scale, free=free_scale)
     for _ in range(ITERATIONS):
         lever = _lever(P, X, Z, eye_to_hand=eye_to_hand)
         information = _inverse(_total(camera, arm, lever))
         weight = _weights(r, information)
         step = _solve(J, r, weight, information)
-        X, Z = moved(X, step[:6]), moved(Z, step[6:12])
-        size = size * np.exp(STRETCHES[:, :free] @ step[12:])
-        r, J = _linearised(P, B, X, Z, size, free)
+        X, Z, scale = moved(X, step[:6]), moved(Z, step[6:12]), scale * float(np.exp(step[12:].sum()))
+        r, J = _linearised(P, B, X, Z, scale, free=free_scale)
         camera, arm = _sources(r, weight, camera, arm, lever, information)
         if np.abs(step).max() < STOP:
             break
     scatter = _total(camera, arm, _lever(P, X, Z, eye_to_hand=eye_to_hand))
     weight = _weights(r, _inverse(scatter))
-    scale, _, deep = size.tolist()
-    return Refined(X, Z, r, scatter, *_uncertainty(J, r, weight, scatter), scale, deep / scale)
+    return Refined(X, Z, r, scatter, *_uncertainty(J, r, weight, scatter), scale)
 
 
 def _linearised(
-    P: Float64, B: Float64, X: Float64, Z: Float64, size: Float64, free: int
+    P: Float64, B: Float64, X: Float64, Z: Float64, scale: float, *, free: bool
 ) -> tuple[Float64, Float64]:
-    """Residuals (N, 6) and their derivative (N, 6, 12 + free), by the logarithms of as many ``STRETCHES`` as are free.
+    """Residuals (N, 6) and their derivative (N, 6, 12), or (N, 6, 13) with the logarithm of the scale.
 
-    The prediction is divided by the size (3,): noise is the camera's first of all, and a regressor with noise would shrink.
+    The prediction is divided by the scale: noise is the camera's first of all, and a regressor with noise would shrink.
     """
     r, J = residuals(P, B, X, Z), jacobian(P, X, Z)
     if not free:
         return r, J
-    predicted = (r[:, :3] + B[:, :3, 3]) / size
+    predicted = (r[:, :3] + B[:, :3, 3]) / scale
     r[:, :3] = predicted - B[:, :3, 3]
-    J[:, :3] /= size[:, None]
-    by_size = np.zeros((len(r), 6, free))
-    by_size[:, :3] = -predicted[..., None] * STRETCHES[:, :free]
-    return r, np.concatenate([J, by_size], axis=2)
+    J[:, :3] /= scale
+    by_scale = np.concatenate([-predicted, np.zeros_like(predicted)], axis=1)
+    return r, np.concatenate([J, by_scale[..., None]], axis=2)
 
 
 def _lever(P: Float64, X: Float64, Z: Float64, *, eye_to_hand: bool) -> Float64:

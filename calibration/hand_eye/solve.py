@@ -33,7 +33,6 @@ OUTLIER = 6.0  # sigma (6-D): 1 of 200,000 Gaussian pairs lies farther out
 FEW = 10  # pairs below which a result is called doubtful
 LOOSE = (0.005, np.radians(0.5))  # m, rad: standard deviations beyond which a result is called doubtful
 SCALE_SIGMAS, SCALE_OFF = 3.0, 0.01  # a size of the target that is farther off by both is wrong
-DEPTH_SIGMAS, DEPTH_OFF = 4.0, 0.02  # a focal length that is farther off by both is wrong
 TARGET_NEAR, TARGET_FAR, MOUNT = 0.1, 5.0, 0.6  # m: what cameras on arms see, and where they sit
 SAME = (2e-4, np.radians(0.02))  # m, rad: an arm that came back stands where it stood
 SEEN_SAME = (0.003, np.radians(0.5))  # m, rad: what a camera sees from there
@@ -58,8 +57,6 @@ class HandEye:
     motion: tuple[float, float, float]
     #: Factor that fits the target's distances to the arm's, and its standard deviation; (1, small) is right
     scale: tuple[float, float]
-    #: Factor that fits the target's distances along the camera's axis besides, and its standard deviation: (1, small) is right
-    depth: tuple[float, float]
     scale_used: float  #: Factor with which X was solved: one, the given one, or that of ``scale``
     closed_forms: dict[str, Float64]  #: X of each closed form, by name
     starts: tuple[int, int]  #: Starts that ended at X, of how many; the others ended at worse optima
@@ -105,7 +102,6 @@ def solve_hand_eye(
     The target's size is believed unless the pairs contradict it by three sigma. They are then solved with the size that fits, its
     error within the covariance, and the verdict is FAIL where that is 1 % off. ``free_scale`` accepts whatever size fits,
     ``target_scale`` is believed instead of what the pairs say: the factor of the target's distances, one for the size as given.
-    Distances along the camera's axis alone that are 2 % off by four sigma are a wrong focal length, and FAIL.
 
     :class:`DataError` for NaN, mirrored or otherwise impossible poses and lists of different length, :class:`HandEyeRefused` for motion
     or pairs that give no calibration; its ``cause`` names why.
@@ -120,15 +116,12 @@ def solve_hand_eye(
     start, size = scaled_consensus(P, B)
     check_agreement(A, scaled(B, size), start, eye_to_hand=eye_to_hand)
 
-    def fit(X: Float64, Z: Float64, *, given: float = 1.0, free: bool = False, deep: bool = False) -> Refined:
-        noise, seen = start.noise, scaled(B, given)
-        return refine(P, seen, X, Z, noise, eye_to_hand=eye_to_hand, free_scale=free, free_depth=deep)
+    def fit(X: Float64, Z: Float64, *, given: float = 1.0, free: bool = False) -> Refined:
+        return refine(P, scaled(B, given), X, Z, start.noise, eye_to_hand=eye_to_hand, free_scale=free)
 
     own = fit(start.X, start.Z, given=size, free=True)
     factor = size * own.scale
     scale = factor, factor * float(np.sqrt(own.covariance[12, 12]))
-    deep = fit(own.X, own.Z, given=size, deep=True)
-    depth = deep.depth, deep.depth * float(np.sqrt(deep.covariance[13, 13]))
     off = not free_scale and abs(factor - 1) > SCALE_SIGMAS * scale[1]
     free = free_scale or (target_scale is None and off)
     used = factor if free else target_scale or 1.0
@@ -143,9 +136,6 @@ def solve_hand_eye(
     )
     size_said = [f"{Cause.TARGET_SCALE}: {_size_in_words(scale)}"] if off else []
     failed = off and target_scale is None and abs(factor - 1) > SCALE_OFF
-    unfocused = abs(depth[0] - 1) > max(DEPTH_SIGMAS * depth[1], DEPTH_OFF)
-    # Views of much the same depth take a wrong focal length for a wrong size, and then both are off.
-    failures = [_depth_in_words(depth)] if unfocused else size_said if failed else []
     return HandEye(
         found.X,
         found.Z,
@@ -158,13 +148,12 @@ def solve_hand_eye(
         found.covariance[:6, :6],
         motion,
         scale,
-        depth,
         used,
         closed,
         (ended, len(starts)),
         rotation_bound(P, B, found.X, found.Z, found.weight),
-        tuple(failures),
-        tuple(looks if failures else looks + size_said),
+        tuple(size_said if failed else ()),
+        tuple(looks if failed else looks + size_said),
     )
 
 
@@ -252,14 +241,6 @@ def _size_in_words(scale: tuple[float, float]) -> str:
     )
 
 
-def _depth_in_words(depth: tuple[float, float]) -> str:
-    factor, off = depth
-    return (
-        f"{Cause.FOCAL_LENGTH}: the target's distances along the camera's axis fit best multiplied by {factor:.4f} +- {off:.4f}, "
-        "those across it do not: calibrate the lens of the camera, and take the target's poses anew"
-    )
-
-
 def to_dict(result: HandEye) -> dict[str, Any]:
     """Return the result as JSON types: the transforms in metres, summaries in mm and degrees."""
     moved, turned = distances(result.residual)
@@ -291,7 +272,6 @@ def to_dict(result: HandEye) -> dict[str, Any]:
             "standard_error": result.scale[1],
             "used": result.scale_used,
         },
-        "target_depth": {"factor": result.depth[0], "standard_error": result.depth[1]},
         "optimum": {
             "starts": result.starts[1],
             "ended_here": result.starts[0],

@@ -28,6 +28,10 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     add("--far", type=float, metavar="M", help="deepest ground truth, metres (default: 2.0)")
     scales = "resolutions of the ground truth, in ToF images: 1 2 4 adds 4x (default: 1 2)"
     add("--scales", nargs="+", type=int, choices=(1, 2, 4), default=(1, 2), metavar="S", help=scales)
+    truth = (
+        "fused of all views of a scene where their poses allow, or each view's single one (default: single)"
+    )
+    add("--truth", choices=("fused", "single"), default="single", metavar="TRUTH", help=truth)
     add("--jobs", type=int, metavar="N", help="processes (default: one per core, at most 4)")
     engine = "who builds: process or dask (default: process)"
     add("--engine", choices=("process", "dask"), default="process", metavar="ENGINE", help=engine)
@@ -64,6 +68,7 @@ def _run(args: argparse.Namespace) -> Outcome:
         **_positive(args.crop_radius, "crop_radius"),
         **_positive(args.far, "far"),
         scales=tuple(sorted({*SCALES, *args.scales})),
+        truth=args.truth,
     )
     _positive(args.jobs, "jobs")
     start = time.monotonic()
@@ -102,6 +107,7 @@ def _outcome(result: BuildResult, seconds: float, *, complete: bool) -> Outcome:
         "gt": None if result.gt is None else result.gt.table(),
         "failures": {scene: {"message": e.message, "hint": e.hint} for scene, e in result.failures.items()},
         "bare": {scene: list(names) for scene, names in result.bare.items()},
+        "alone": {scene: dict(why) for scene, why in result.alone.items()},
         "missing": list(result.missing),
         "peak_memory_bytes": result.peak_memory,
         "seconds": round(seconds, 2),
@@ -131,6 +137,12 @@ def _text(result: BuildResult, views: int, seconds: float) -> str:
     lines += [
         f"no good ground truth in {scene}: {', '.join(names)}; they stay in the shard, fully masked"
         for scene, names in result.bare.items()
+    ]
+    lines += [
+        f"not fused, {scene} {counted(list(why.values()).count(reason), 'view')}: {reason}: "
+        f"{', '.join(name for name, said in why.items() if said == reason)}"
+        for scene, why in result.alone.items()
+        for reason in dict.fromkeys(why.values())
     ]
     if result.missing:
         lines.append(

@@ -50,6 +50,8 @@ class BuildResult:
         Error by scene that has no shard.
     bare
         Names of the views, by scene, that have no pixel of good ground truth: nothing can be learned from them.
+    alone
+        Why a view's truth is that of its own stereo camera, by scene and name, where a fused one was wanted.
     missing
         Scenes that are other calls' to build and are not there yet; then there is no manifest either.
     gt
@@ -63,6 +65,7 @@ class BuildResult:
     skipped: tuple[str, ...]
     failures: Mapping[str, TofError]
     bare: Mapping[str, tuple[str, ...]]
+    alone: Mapping[str, Mapping[str, str]]
     missing: tuple[str, ...]
     gt: TruthError | None
     peak_memory: int
@@ -291,12 +294,17 @@ def _result(
         scene: tuple(view["name"] for view in p["views"] if view["good_pixels"] == 0)
         for scene, p in known.items()
     }
+    alone = {
+        scene: {view["name"]: view["why"] for view in p["views"] if "why" in view}
+        for scene, p in known.items()
+    }
     return BuildResult(
         dataset=out,
         scenes=entries,
         skipped=tuple(scene for scene, o in sorted(outcomes.items()) if o.skipped),
         failures=dict(sorted(failures.items())),
         bare={scene: names for scene, names in bare.items() if names},
+        alone={scene: why for scene, why in alone.items() if why},
         missing=missing,
         gt=_finish(out, entries, config) if complete else None,
         peak_memory=max((o.peak_memory for o in outcomes.values()), default=0),

@@ -40,6 +40,7 @@ class DatasetView(NamedTuple):
     mask: NDArray[
         np.uint8
     ]  #: (sH, sW) bits of :class:`tofcapture.files.layout.MaskBit`; 0 is good ground truth
+    sigma: Float32  #: (sH, sW) metres, one standard deviation of depth; NaN: not known, as where the truth is not fused
     intrinsics: Float64  #: (4,) fx, fy, cx, cy of the sensor's image, pixels
     T_base_tof: Float64  #: (4, 4) ToF camera to the arm's base
 
@@ -103,6 +104,7 @@ class Dataset:
             truth.depth,
             truth.normals,
             truth.mask,
+            np.full(truth.depth.shape, np.nan, np.float32) if truth.sigma is None else truth.sigma,
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
             shard.T_base_tof(view),
         )

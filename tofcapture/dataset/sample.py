@@ -11,22 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
+from tofcapture.dataset.surface import SPARSE, Surface, clean, find_object, fused
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.shard import ExactMaps, GroundTruth, Sample, ShardReader, TofMaps
 from tofcapture.frames import TofInfo, View
-from tofcapture.ops.crop import WHOLE, Crop, crop_depth, find_crop, refine_clearance
-from tofcapture.ops.denoise import denoise
+from tofcapture.ops.crop import Crop, crop_depth, refine_clearance
 from tofcapture.ops.normals import PlaneField, grazing
 from tofcapture.ops.phase import Decoder
 from tofcapture.ops.project import Projection, Sheet, project, triangulate
-from tofcapture.poses import Float64, transform_points
 from tofcapture.rig import Rig
 
 Float32 = NDArray[np.float32]
 SCALES = (1, 2)  # always there
 FINEST = (*SCALES, 4)
-SPARSE = 4  # pixels between points that vote for the table
+TRUTHS = ("fused", "single")
 
 
 @dataclass(frozen=True)
@@ -44,20 +43,35 @@ class SampleConfig:
         Largest depth of ground truth in the ToF frame, metres.
     scales
         Of the ToF image's resolution, that ground truth is made at: 1 and 2, or 1, 2 and 4.
+    truth
+        ``fused``: of all views of a scene where their poses allow it; ``single``: each view's own stereo camera alone.
     """
 
     crop_radius: float = 0.35
     far: float = 2.0
     scales: tuple[int, ...] = SCALES
+    truth: str = "single"
 
     def __post_init__(self) -> None:
         if tuple(self.scales) not in (SCALES, FINEST):
             raise ConfigError(f"scales: expected {SCALES} or {FINEST}, got {self.scales}")
+        if self.truth not in TRUTHS:
+            raise ConfigError(f"truth: expected {' or '.join(TRUTHS)}, got {self.truth!r}")
         object.__setattr__(self, "scales", tuple(self.scales))
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """How far the object extends along the table, and the largest depth, metres."""
+        return self.crop_radius, self.far
 
     def table(self) -> dict[str, Any]:
         """Return the config as JSON types."""
-        return {"crop_radius": self.crop_radius, "far": self.far, "scales": list(self.scales)}
+        return {
+            "crop_radius": self.crop_radius,
+            "far": self.far,
+            "scales": list(self.scales),
+            "truth": self.truth,
+        }
 
 
 def make_sample(
@@ -67,6 +81,7 @@ def make_sample(
     rng: np.random.Generator,
     decoder: Decoder,
     depth: Float32 | None = None,
+    surface: tuple[Surface, int] | None = None,
 ) -> Sample:
     """Make one sample: the paper's pre-processing, section III.
 
@@ -86,6 +101,8 @@ def make_sample(
         Of the ToF camera: :func:`decoder_for`.
     depth
         (SH, SW) z of the view's point map, for a view that was read without it.
+    surface
+        The scene's, and the view's number in it, to take the truth from; ``None``: from the view's own cloud.
     """
     check_cameras(view, rig)
     T_base_tof = view.arm_before.T_base_flange @ rig.T_flange_tof
@@ -93,15 +110,15 @@ def make_sample(
     decoded = decoder.burst(view.tof.raw, float(np.mean(view.tof.celsius)))
     # Denoise the stereo depth.
     measured = np.ascontiguousarray(view.stereo.points[..., 2] if depth is None else depth)
-    native = np.where(denoise(measured, rig.stereo), measured, np.float32(np.nan))
+    native = clean(measured, rig)
     # Align it with the ToF camera, and crop what stands on the table.
-    # Without an arm nobody knows which way is up: all of it is the object.
-    crop_config = config if view.has_arm else replace(config, crop_radius=WHOLE)
-    crop = find_object(native, rig, T_base_tof, crop_config, rng)
-    # Project the surface on the ToF plane, with normals and mask.
+    crop = find_object(view, native, rig, config.reach, rng)
+    # Project the surface on the ToF plane, with normals and mask: the view's own, or what all views of the scene say.
     sheet = triangulate(native, rig.stereo)
     planes = PlaneField(np.where(sheet.vertex, sheet.depth, np.nan), rig.stereo)
-    truths = {scale: _ground_truth(sheet, planes, crop, rig, scale, config.far) for scale in config.scales}
+    truths = {
+        scale: _ground_truth(sheet, planes, crop, rig, scale, config.far, surface) for scale in config.scales
+    }
     return Sample(
         index=view.index,
         raw=view.tof.raw,
@@ -140,20 +157,16 @@ def decoder_for(view: View, rig: Rig) -> Decoder:
 
 
 def _ground_truth(
-    sheet: Sheet, planes: PlaneField, crop: Crop, rig: Rig, scale: int, far: float
-) -> GroundTruth:
+    sheet: Sheet, planes: PlaneField, crop: Crop, rig: Rig, scale: int, far: float, surface: tuple[Surface, int] | None
+) -> GroundTruth:  # fmt: skip
     camera = rig.tof.scaled(scale)
     seen = project(sheet, rig.stereo, rig.T_tof_stereo, camera, edge_pixels=scale, far=far)
-    return masked(smoothed(seen, planes, rig, camera), rig, camera, crop)
-
-
-def find_object(
-    native: Float32, rig: Rig, T_base_tof: Float64, config: SampleConfig, rng: np.random.Generator
-) -> Crop:
-    """Find the table, and so the object on it, in every fourth point of every fourth row of stereo depth (SH, SW)."""
-    points = native[::SPARSE, ::SPARSE, None] * rig.stereo.rays[::SPARSE, ::SPARSE]
-    points = transform_points(rig.T_tof_stereo, points)
-    return find_crop(points, T_base_tof[2, :3], rng, config.crop_radius, config.far)
+    if surface is None:
+        return masked(smoothed(seen, planes, rig, camera), rig, camera, crop)
+    seen, sigma, views = fused(*surface, rig, camera, smoothed(seen, planes, rig, camera), scale, far)
+    # The last of 24 bits are noise of no use, and would be most of what a shard stores of it.
+    coarse = (sigma.astype(np.float32).view(np.uint32) & np.uint32(0xFFFF8000)).view(np.float32)
+    return replace(masked(seen, rig, camera, crop, alone=np.abs(views) <= 1), sigma=coarse, views=views)
 
 
 def smoothed(projection: Projection, planes: PlaneField, rig: Rig, camera: Camera) -> Projection:
@@ -164,12 +177,19 @@ def smoothed(projection: Projection, planes: PlaneField, rig: Rig, camera: Camer
     return replace(projection, depth=depth, normals=normals)
 
 
-def masked(projection: Projection, rig: Rig, camera: Camera, crop: Crop) -> GroundTruth:
-    """Put every reason for mistrust into the bits of one mask; where nothing is cropped, nothing is OUTSIDE."""
+def masked(
+    projection: Projection, rig: Rig, camera: Camera, crop: Crop, alone: NDArray[np.bool_] | None = None
+) -> GroundTruth:
+    """Put every reason for mistrust into the bits of one mask; where nothing is cropped, nothing is OUTSIDE.
+
+    Where the view is not ``alone`` (H, W), others saw a surface better, and the standard deviation tells how well it is known.
+    """
     some = projection.depth[::SPARSE, ::SPARSE, None] * camera.rays[::SPARSE, ::SPARSE]
     crop = refine_clearance(crop, some[~projection.edge[::SPARSE, ::SPARSE]])
     slanted = np.empty(camera.shape, dtype=bool)
     grazing(projection.depth, projection.normals, camera.rays, rig.T_tof_stereo[:3, 3].copy(), slanted)
+    if alone is not None:
+        slanted &= alone
     mask = np.zeros(camera.shape, dtype=np.uint8)
     for bit, where in (
         (MaskBit.NOT_HIT, np.isnan(projection.depth)),

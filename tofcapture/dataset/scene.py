@@ -33,6 +33,7 @@ from tofcapture.dataset.sample import (
     pooled,
     view_error,
 )
+from tofcapture.dataset.surface import Surface, put_together
 from tofcapture.errors import DataError, TofError
 from tofcapture.files.disk import full_disk_named
 from tofcapture.files.hdf import dumps
@@ -164,7 +165,11 @@ def build_shard(
         made = work / task.path.name
         info = calibrated(first.tof.info, task.rig)
         with ShardWriter(made, task.scene, task.rig, info, first.stereo.info, len(task.views)) as shard:
-            for path, (sample, error) in zip(task.views, _samples(task, decoder, pool), strict=True):
+            surface = None
+            if task.config.truth == "fused":
+                surface = put_together(task.views, task.rig, task.config.reach, work / "clouds", pool)
+            made_of = _samples(task, decoder, pool, surface)
+            for path, (sample, error) in zip(task.views, made_of, strict=True):
                 shard.add(sample, path)
                 mask = sample.ground_truth[2].mask
                 good.append(int((mask == 0).sum()))
@@ -182,26 +187,31 @@ def build_shard(
                     f"{task.scene}: stereo measured nothing in the ToF camera's image in any of {len(good)} views",
                     hint="is it the rig of these cameras? tofcapture view shows both",
                 )
-            digest = shard.seal(_provenance(task, inputs, first, good, pooled(errors) if errors else None))
+            digest = shard.seal(
+                _provenance(task, inputs, first, good, pooled(errors) if errors else None, surface)
+            )
         digest_path(made).replace(digest_path(task.path))  # first: a shard always has its digest
         made.replace(task.path)
     return digest
 
 
 def sample_of(
-    path: Path, rig: Rig, config: SampleConfig, decoder: Decoder
+    path: Path, rig: Rig, config: SampleConfig, decoder: Decoder, surface: tuple[Surface, int] | None
 ) -> tuple[Sample, ViewError | None]:
     """Read a view and make its sample, with its error where the truth is known."""
     view, depth = read_depth_view(path)
-    sample = make_sample(view, rig, config, np.random.default_rng(view.index), decoder, depth)
+    sample = make_sample(view, rig, config, np.random.default_rng(view.index), decoder, depth, surface)
     return sample, view_error(sample, view)
 
 
 def _samples(
-    task: SceneTask, decoder: Decoder, pool: Pool | None
+    task: SceneTask, decoder: Decoder, pool: Pool | None, surface: Surface | None
 ) -> Iterator[tuple[Sample, ViewError | None]]:
     """Samples in the order of the views, made here or in the pool."""
-    work = [(path, task.rig, task.config, decoder) for path in task.views]
+    work = [
+        (path, task.rig, task.config, decoder, None if surface is None else (surface, number))
+        for number, path in enumerate(task.views)
+    ]
     if pool is None:
         yield from (sample_of(*arguments) for arguments in work)
         return
@@ -229,8 +239,9 @@ def _work_folder(path: Path) -> Iterator[Path]:
 
 
 def _provenance(
-    task: SceneTask, inputs: Sequence[str], first: View, good: Sequence[int], gt: TruthError | None
-) -> dict[str, Any]:
+    task: SceneTask, inputs: Sequence[str], first: View, good: Sequence[int], gt: TruthError | None,
+    surface: Surface | None,
+) -> dict[str, Any]:  # fmt: skip
     # Simulated scenes know their objects; check looks for them in other splits.
     objects = first.provenance.get("objects")
     return {
@@ -239,11 +250,25 @@ def _provenance(
         "config": task.config.table(),
         "versions": versions(),
         "views": [
-            {"name": path.name, "sha256": digest, "good_pixels": pixels}
-            for path, digest, pixels in zip(task.views, inputs, good, strict=True)
+            {"name": path.name, "sha256": digest, "good_pixels": pixels, **truth}
+            for path, digest, pixels, truth in zip(
+                task.views, inputs, good, _truths(task, surface), strict=True
+            )
         ],
         "gt": None if gt is None else gt.table(),
     }
+
+
+def _truths(task: SceneTask, surface: Surface | None) -> list[dict[str, Any]]:
+    """Say of every view whether its truth is fused, and of how many views, or why it is its own alone."""
+    if surface is None:
+        return [{"truth": "single"}] * len(task.views)
+    return [
+        {"truth": "single", "why": surface.alone[k]}
+        if k in surface.alone
+        else {"truth": "fused", "of": len(surface.members(k))}
+        for k in range(len(task.views))
+    ]
 
 
 def _peak_memory() -> int:

@@ -163,11 +163,15 @@ def _sizes(file: h5py.File, info: TofInfo, stereo: StereoInfo) -> dict[str, int]
 
 def _expected(file: h5py.File, field: Field, layout: Layout) -> bool:
     """Whether a dataset has to be there; the optional ones of a group are there together or not at all."""
+    if not field.optional:
+        return True
+    if field.path.startswith("fused/"):  # at the scales of the ground truth
+        return "fused" in file and f"gt/depth_{field.path[-2:]}" in file
     group = field.path.split("/", maxsplit=1)[0]
     mates = [f for f in layout if f.path.startswith(f"{group}/")]
     if all(f.optional for f in mates):
         return group in file
-    return not field.optional or any(f.optional and f.path in file for f in mates)
+    return any(f.optional and f.path in file for f in mates)
 
 
 def _check_field(
@@ -249,6 +253,8 @@ def _projected(file: h5py.File, view: int, scale: int, rays: Array) -> Iterator[
     if bad.any():
         yield where, f"expected depth exactly where NOT_HIT is unset, {_count(bad)} disagree"
     yield from _known_bits(where, mask, MaskBit, "bits")
+    if "fused" in file:
+        yield from _depth(f"/fused/sigma_{scale}x[{view}]", file[f"fused/sigma_{scale}x"][view], FARTHEST)
     where = f"/gt/normals_{scale}x[{view}]"
     yield from _unit_normals(where, normals, np.isfinite(depth))
     away = np.einsum("hwc,hwc->hw", normals.astype(np.float64), rays) > 1e-6  # NaN compares false

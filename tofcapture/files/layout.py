@@ -139,6 +139,10 @@ gt/depth_{0}x{1}   | float32 | N {2}H {2}W   | 1 * *   | m | ground-truth depth 
 gt/normals_{0}x{1} | float32 | N {2}H {2}W 3 | 1 * * * | 1 | ground-truth normals, ToF frame, unit, facing the camera
 gt/mask_{0}x{1}    | uint8   | N {2}H {2}W   | 1 * *   | 1 | mask bits, see below; 0: good ground truth
 """
+_FUSED = """\
+fused/sigma_{0}x? | float32 | N {1}H {1}W | 1 * * | m | standard deviation of that depth; NaN: not known
+fused/views_{0}x? | int8 | N {1}H {1}W | 1 * * | 1 | views that it is made of; negative: not the own one; 0: none
+"""
 # One coordinate of the point map per chunk: x, y and z each pack better alone, and depth is read without the others.
 VIEW = _layout(
     "tofcapture-view",
@@ -175,6 +179,7 @@ tof/confidence    | float32        | N H W     | 1 * *     | DN   | amplitude of
 tof/flags         | uint8          | N H W     | 1 * *     | 1    | flag bits, see below; 0: a good pixel
 gt/native_depth   | float32        | N SH SW   | 1 * *     | m    | cropped and denoised stereo depth (z), stereo frame; NaN: none
 {_PROJECTED.format(1, "", "")}{_PROJECTED.format(2, "", 2)}{_PROJECTED.format(4, "?", 4)}\
+{_FUSED.format(1, "")}{_FUSED.format(2, 2)}{_FUSED.format(4, 4)}\
 views/T_base_tof  | float64        | N 4 4     | -         | m    | ToF to base, from the measured joints and the rig
 views/index       | int64          | N         | -         | 1    | number of the view in its recording
 truth/depth_2x?   | float32        | N 2H 2W   | 1 * *     | m    | exact depth at 2x (simulated recordings)
@@ -189,7 +194,7 @@ def _table(header: str, rows: list[str]) -> str:
     return "\n".join([header, "|---" * (header.count("|") - 1) + "|", *rows, ""])
 
 
-_AS_ABOVE = re.compile("^arm/after|_4x$")  # the page says of these that they are as others
+_AS_ABOVE = re.compile("^arm/after|_4x$|^fused.*_1x$")  # the page says of these that they are as others
 
 
 def _section(layout: Layout) -> str:

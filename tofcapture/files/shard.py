@@ -69,11 +69,17 @@ class GroundTruth:
         (sH, sW, 3) float32, ToF frame, unit, facing the camera; NaN where depth is.
     mask
         (sH, sW) uint8, bits of :class:`tofcapture.files.layout.MaskBit`; 0 is good ground truth.
+    sigma
+        (sH, sW) float32, metres, one standard deviation of depth; NaN: not known. ``None``: the shard was built of single views.
+    views
+        (sH, sW) int8, how many views the depth is made of; negative where the view's own stereo camera is not among them.
     """
 
     depth: Float32
     normals: Float32
     mask: NDArray[np.uint8]
+    sigma: Float32 | None = None
+    views: NDArray[np.int8] | None = None
 
 
 @dataclass(frozen=True)
@@ -326,6 +332,11 @@ class ShardReader:
         """Multiples of the ToF image's resolution that there is ground truth at: 1 and 2, and 4 where it was built."""
         return (1, 2, 4) if "gt/depth_4x" in self._open() else (1, 2)
 
+    @cached_property
+    def fused(self) -> bool:
+        """Whether the ground truth is of all views of the scene, with the standard deviation of every pixel."""
+        return "fused" in self._open()
+
     def ground_truth(self, view: int, scale: Scale) -> GroundTruth:
         """Depth, normals and mask at 1x, 2x or, where it was built, 4x of the ToF image; else :class:`DataError`."""
         if scale not in (1, 2) and scale not in self.scales:
@@ -333,7 +344,9 @@ class ShardReader:
                 f"{self.path}: expected ground truth at {scale}x, it is there at {scales_text(self.scales)}",
                 hint="tofcapture build-dataset RECORDING --out DATASET --scales 1 2 4 builds 1x, 2x and 4x",
             )
-        return GroundTruth(*(self._row(f"gt/{name}_{scale}x", view) for name in ("depth", "normals", "mask")))
+        maps = [f"gt/{name}_{scale}x" for name in ("depth", "normals", "mask")]
+        maps += [f"fused/{name}_{scale}x" for name in ("sigma", "views")] if self.fused else []
+        return GroundTruth(*(self._row(name, view) for name in maps))
 
     def native(self, view: int) -> Float32:
         """(SH, SW) float32 cropped and denoised stereo depth, stereo frame, metres; NaN: none."""
@@ -389,6 +402,8 @@ def _rows(sample: Sample) -> dict[str, Array]:
     }
     for scale, gt in sample.ground_truth.items():
         rows |= {f"gt/{name}_{scale}x": getattr(gt, name) for name in ("depth", "normals", "mask")}
+        if gt.sigma is not None:
+            rows |= {f"fused/{name}_{scale}x": getattr(gt, name) for name in ("sigma", "views")}
     if sample.truth is not None:
         rows |= {"truth/depth_2x": sample.truth.depth, "truth/normals_2x": sample.truth.normals}
     return {path: np.asarray(row) for path, row in rows.items()}

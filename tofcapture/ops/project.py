@@ -89,6 +89,11 @@ def _jumps(depth: Float64, camera: Camera) -> Bool:
     return out
 
 
+def edges(depth: Float64, camera: Camera, edge_pixels: int) -> Bool:
+    """Mark the pixels (H, W) that are so near to a step in depth, or to a pixel without depth."""
+    return _dilate(np.isnan(depth) | _jumps(depth, camera), edge_pixels)
+
+
 def _through_lens(
     sheet: Sheet, stereo: Camera, T_tof_stereo: Float64, camera: Camera, edge_pixels: int, far: float
 ) -> Projection:
@@ -160,6 +165,26 @@ def project(
         occluded=aside | (np.isfinite(hidden) & ~(hidden > depth * (1 - HIDES) - HIDES)),
         edge=edge,
     )
+
+
+def place_hits(
+    depth: NDArray[np.floating], surface: Bool, x: Float64, y: Float64, T: Float64, camera: Camera, far: float
+) -> tuple[Float64, Float64]:
+    """Find where the rays of a pinhole camera first meet a sheet's surface from its front; nothing else is asked.
+
+    ``depth`` (h, w) is NaN at what is no corner of ``surface`` (h-1, w-1), ``x`` (w,) and ``y`` (h,) are the rays of its grid,
+    ``T`` (4, 4) maps its frame to the camera's. Points deeper than ``far`` there are no surface.
+
+    Returns (H, W) depth, NaN: no surface, and (H, W, 2) the place (u, v) on the grid.
+    """
+    found = np.full((camera.height * camera.width, 6), np.inf)
+    eye = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    skirt = np.full(camera.height * camera.width, np.inf)
+    _render(
+        depth.astype(np.float64), np.ascontiguousarray(surface), x, y, T, far, eye, camera.shape, found, skirt
+    )
+    image = found.reshape(*camera.shape, 6)
+    return np.where(np.isfinite(image[..., 0]), image[..., 0], np.nan), image[..., 1:3]
 
 
 def _borders(

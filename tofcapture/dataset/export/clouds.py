@@ -13,14 +13,14 @@ from tofcapture.files.layout import MASK_DOCS
 from tofcapture.files.seal import replacing
 from tofcapture.files.shard import ShardReader
 
-_POINT = np.dtype([(n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")] + [("mask", "u1")])
+_POINT = [(n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")] + [("mask", "u1")]
 
 
 def export_ply(scene: SceneExport) -> list[Path]:
     """Write ``folder/view-003.ply`` for every view; the number is the view's row in the shard.
 
     Vertices are the ground truth at 2x, wherever the ray hits, in the ToF frame in metres. ``mask`` holds the mask bits, 0 is
-    good. A comment holds the pose ``T_base_tof`` (16 numbers, by rows).
+    good; ``sigma`` is there where the truth is fused. A comment holds the pose ``T_base_tof`` (16 numbers, by rows).
     """
     bits = ", ".join(f"{int(bit)} {bit.name}" for bit in MASK_DOCS)
     shard, paths = scene.shard, []
@@ -41,11 +41,13 @@ def export_ply(scene: SceneExport) -> list[Path]:
 def _points(shard: ShardReader, view: int) -> NDArray[Any]:
     gt = shard.ground_truth(view, 2)
     hit = np.isfinite(gt.depth)
-    out = np.zeros(int(hit.sum()), _POINT)
+    out = np.zeros(int(hit.sum()), _POINT if gt.sigma is None else [*_POINT, ("sigma", "<f4")])
     points = shard.points(view, 2)[hit]
     for i, (p, n) in enumerate((("x", "nx"), ("y", "ny"), ("z", "nz"))):
         out[p], out[n] = points[:, i], gt.normals[hit][:, i]
     out["mask"] = gt.mask[hit]
+    if gt.sigma is not None:
+        out["sigma"] = gt.sigma[hit]
     return out
 
 

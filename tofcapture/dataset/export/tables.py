@@ -80,9 +80,8 @@ def export_huggingface(scene: SceneExport) -> list[Path]:
             "tof_flags": tof.flags,
         }
         for scale in shard.scales:
-            gt = shard.ground_truth(view, scale)
-            maps = {"depth": gt.depth, "normals": gt.normals, "mask": gt.mask}
-            out |= {f"gt_{name}_{scale}x": a for name, a in maps.items()}
+            maps = vars(shard.ground_truth(view, scale))
+            out |= {f"gt_{name}_{scale}x": a for name, a in maps.items() if a is not None}
         return out
 
     _write_rows(path, (row(v) for v in range(shard.views)))

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.colours import GROUND_TRUTH, REMOVED, SENSOR
-from tofcapture.dataset.sample import SampleConfig, check_cameras, decoder_for, find_object
+from tofcapture.dataset.sample import SampleConfig, check_cameras, decoder_for
+from tofcapture.dataset.surface import find_object
 from tofcapture.errors import DataError
 from tofcapture.files.view import open_view
 from tofcapture.frames import View
@@ -79,8 +80,7 @@ def preprocess(view: View, rig: Rig) -> Steps:
     measured = np.ascontiguousarray(view.stereo.points[..., 2])
     clean = denoise(measured, rig.stereo)
     native = np.where(clean, measured, np.float32(np.nan))
-    T_base_tof = view.arm_before.T_base_flange @ rig.T_flange_tof
-    crop = find_object(native, rig, T_base_tof, _CONFIG, np.random.default_rng(view.index))
+    crop = find_object(view, native, rig, _CONFIG.reach, np.random.default_rng(view.index))
     there = np.isfinite(crop_depth(crop, measured, rig.stereo, rig.T_tof_stereo))
     if not (there & clean).any():
         raise DataError(

@@ -1,0 +1,400 @@
+"""One surface a scene: the stereo clouds of all its views in one frame, from which every view's ground truth is fused.
+
+:func:`put_together` is the story. Each view's cloud is measured and laid down in files that all processes map; the arm's poses
+are refined jointly; views that do not see the same surface as the others are kept apart, and named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.camera import Camera
+from tofcapture.errors import TofError
+from tofcapture.files.view import read_depth_view
+from tofcapture.frames import View
+from tofcapture.ops.crop import WHOLE, Crop, crop_depth, find_crop
+from tofcapture.ops.denoise import denoise
+from tofcapture.ops.fuse import INNER, SURFACE, TARGET, Clouds, Hits, fuse, meet
+from tofcapture.ops.normals import PlaneField
+from tofcapture.ops.project import Projection, Sheet, edges, place_hits, triangulate
+from tofcapture.ops.register import Samples, register, spread
+from tofcapture.pool import Pool
+from tofcapture.poses import Float64, invert, rotate_vectors, transform_points
+from tofcapture.rig import Rig
+
+SPARSE = 4  # pixels between points that vote for the table
+BORDER = 2  # cells from where the surface is cut, in which matches mix both sides
+MARGIN = 12  # cells about the object
+ABOUT = 0.02  # m, about the object, that are fused with it
+PLACES = 600, 300  # sampled planes of the object and of what is about it
+LENS_FINER = 3  # times as fine a pinhole image is what a lens is looked up in
+CORRELATED_LAG = 2  # pixels, at which the noise's correlation is measured
+APART = "it does not see what the others see: the object moved, or its pose is wrong"
+MOST = 1000.0  # pixels whose noise is one
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Tell of one view's cloud what the joint refinement needs."""
+
+    samples: Samples
+    T_base_stereo: Float64  #: (4, 4) as the arm and the rig say.
+    posed: bool  #: Whether anybody said where the view was taken.
+    turn: float  #: Of the object, degrees.
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Say where the clouds of a scene lie, and which of them one view's ground truth is made of.
+
+    Attributes
+    ----------
+    folder
+        Of the clouds' files.
+    poses
+        (N, 4, 4) of the stereo cameras, refined.
+    group
+        (N,) views of one number see one surface.
+    pose_sigma
+        (N, N) metres, by which one view's surface is off another's through both poses.
+    bounds
+        (N, 2, 3) least and largest coordinates of each group's object, base frame, metres.
+    alone
+        Reason by the number of a view in the scene's list whose truth is its own alone.
+    """
+
+    folder: Path
+    poses: Float64
+    group: NDArray[np.intp]
+    pose_sigma: Float64
+    bounds: Float64
+    alone: Mapping[int, str]
+
+    def members(self, view: int) -> NDArray[np.intp]:
+        """Number the views that a view's truth is made of."""
+        return np.flatnonzero(self.group == self.group[view])
+
+    def clouds(self) -> Clouds:
+        """Map the clouds of all views from their files."""
+        arrays = {n: np.asarray(np.load(self.folder / f"{n}.npy", mmap_mode="r")) for n in _SHAPES}
+        return Clouds(**arrays)
+
+
+_SHAPES: dict[str, Any] = {
+    "depth": np.float32,
+    "quads": np.uint8,
+    "planes": np.float32,
+    "free": np.float32,
+    "boxes": np.int64,
+}
+
+
+def _shape(name: str, views: int, camera: Camera) -> tuple[int, ...]:
+    height, width = camera.height // 2, camera.width // 2
+    last = {"quads": (height - 1, width - 1), "planes": (height, width, 5), "boxes": (4,)}
+    return views, *last.get(name, (height, width))
+
+
+def put_together(
+    paths: Sequence[Path], rig: Rig, reach: tuple[float, float], folder: Path, pool: Pool | None = None
+) -> Surface:
+    """Measure, refine, group.
+
+    ``reach`` is how far the object extends along the table and the largest depth, metres; ``folder`` receives the clouds.
+    """
+    folder.mkdir()
+    for name, dtype in _SHAPES.items():
+        np.lib.format.open_memmap(
+            folder / f"{name}.npy", "w+", dtype=dtype, shape=_shape(name, len(paths), rig.stereo)
+        ).flush()
+    work = [(path, rig, reach, folder, number) for number, path in enumerate(paths)]
+    if pool is None:
+        found = [measure(*arguments) for arguments in work]
+    else:
+        made: dict[int, Measured] = {}
+        for number, one in pool.run(measure, work):
+            if isinstance(one, TofError):
+                raise one
+            made[number] = one
+        found = [made[number] for number in range(len(paths))]
+    return _joined(found, rig, folder)
+
+
+def _joined(found: Sequence[Measured], rig: Rig, folder: Path) -> Surface:
+    """Refine the poses of each turn of the object; what cannot be fused stays alone, with the reason."""
+    poses = np.stack([m.T_base_stereo for m in found])
+    group, sigma = np.arange(len(found)), np.zeros((len(found), len(found)))
+    alone: dict[int, str] = {}
+    planes, free = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("planes", "free"))
+    for number, m in enumerate(found):
+        if not m.posed:
+            alone[number] = "nobody said where it was taken"
+        elif not m.samples.target.any():
+            alone[number] = "stereo saw nothing of the object"
+    for turn in sorted({m.turn for m in found}):
+        mine = [k for k, m in enumerate(found) if m.turn == turn and k not in alone]
+        if len(mine) < 2:
+            alone |= dict.fromkeys(mine, "no other view of it")
+            continue
+        samples = [found[k].samples for k in mine]
+        done = register(samples, planes[mine], free[mine], rig.stereo, poses[mine])
+        sigma[np.ix_(mine, mine)] = spread(done, samples)
+        for place, k in enumerate(mine):
+            together = int((done.group == done.group[place]).sum())
+            if together == 1:
+                met = np.isfinite(done.agreeing[place]) | np.isfinite(done.agreeing[:, place])
+                alone[k] = APART if met.any() else "no other view shows the same part of the object"
+            else:
+                poses[k] = done.poses[place]
+                group[k] = mine[int(np.flatnonzero(done.group == done.group[place])[0])]
+    bounds = np.zeros((len(found), 2, 3))
+    for number in set(group.tolist()):
+        mine = [k for k in np.flatnonzero(group == number).tolist() if found[k].samples.target.any()]
+        points = [transform_points(poses[k], found[k].samples.points[found[k].samples.target]) for k in mine]
+        if points:
+            cloud = np.concatenate(points)
+            bounds[number] = cloud.min(axis=0) - ABOUT, cloud.max(axis=0) + ABOUT
+    return Surface(folder, poses, group, sigma, bounds, alone)
+
+
+def measure(path: Path, rig: Rig, reach: tuple[float, float], folder: Path, number: int) -> Measured:
+    """Measure the cloud of one view and lay it down."""
+    view, depth = read_depth_view(path)
+    native = clean(depth, rig)
+    sheet = triangulate(native, rig.stereo)
+    crop = find_object(view, native, rig, reach, np.random.default_rng(view.index))
+    target: NDArray[np.bool_] = np.isfinite(crop_depth(crop, native, rig.stereo, rig.T_tof_stereo))
+    arrays = _cloud(sheet, target, rig)
+    for name, values in arrays.items():
+        kept = np.load(folder / f"{name}.npy", mmap_mode="r+")
+        kept[number] = values
+        kept.flush()
+    samples = _samples(arrays["planes"], arrays["quads"], rig.stereo, view.index)
+    # Without an arm a pose may still be told; one that is exactly nowhere is none.
+    posed = not np.array_equal(view.arm_before.T_base_flange, np.eye(4))
+    turn = float(view.provenance.get("turn_deg", 0.0))
+    return Measured(samples, view.arm_before.T_base_flange @ rig.T_flange_stereo, posed, turn)
+
+
+def clean(depth: NDArray[np.floating], rig: Rig) -> NDArray[np.float32]:
+    """Keep of a stereo depth image (SH, SW) what denoising keeps."""
+    return np.where(denoise(depth, rig.stereo), depth, np.float32(np.nan))
+
+
+def find_object(
+    view: View, native: NDArray[np.float32], rig: Rig, reach: tuple[float, float], rng: np.random.Generator
+) -> Crop:
+    """Find the table, and so the object on it, in every fourth point of every fourth row of stereo depth (SH, SW).
+
+    ``reach`` is as for :func:`put_together`. Without an arm nobody knows which way is up: all of it is the object.
+    """
+    radius, far = reach
+    points = native[::SPARSE, ::SPARSE, None] * rig.stereo.rays[::SPARSE, ::SPARSE]
+    points = transform_points(rig.T_tof_stereo, points)
+    up = (view.arm_before.T_base_flange @ rig.T_flange_tof)[2, :3]
+    return find_crop(points, up, rng, radius if view.has_arm else WHOLE, far)
+
+
+def _cloud(sheet: Sheet, target: NDArray[np.bool_], rig: Rig) -> dict[str, NDArray[Any]]:
+    """Lay out one view as :class:`tofcapture.ops.fuse.Clouds` has it."""
+    from scipy.ndimage import minimum_filter
+
+    camera = rig.stereo
+    height, width = camera.height // 2, camera.width // 2
+    at = np.s_[: 2 * height : 2, : 2 * width : 2]
+    surface: NDArray[np.bool_] = np.zeros((2 * height, 2 * width), dtype=bool)
+    rows, columns = (min(a, b) for a, b in zip(surface.shape, sheet.surface.shape, strict=True))
+    surface[:rows, :columns] = sheet.surface[:rows, :columns]
+    cells: NDArray[np.bool_] = np.asarray(surface.reshape(height, 2, width, 2).all(axis=(1, 3)))[:-1, :-1]
+    inner = minimum_filter(cells.view(np.uint8), 2 * BORDER + 1, mode="constant")
+    quads = (
+        cells * np.uint8(SURFACE)
+        | inner * np.uint8(INNER)
+        | (target[at][:-1, :-1] & cells) * np.uint8(TARGET)
+    )
+    corner: NDArray[np.bool_] = np.zeros((height, width), dtype=bool)
+    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        corner[down : height - 1 + down, right : width - 1 + right] |= cells
+    depth = np.where(sheet.vertex, sheet.depth, np.nan)
+    fitted, residual, share = PlaneField(depth, camera).cells()
+    planes = np.empty((height, width, 5), dtype=np.float32)
+    noise = float(np.nanmedian(residual)) if np.isfinite(residual).any() else 1e-3
+    planes[..., :3] = fitted
+    planes[..., 3] = np.where(np.isfinite(residual), residual, noise)
+    alike = np.sqrt(_correlated(depth, fitted, residual, camera))
+    # A window that is hardly wider than its noise averages more of it than the count says.
+    planes[..., 4] = residual * share * alike * np.maximum(1 - alike * share / np.pi, 0.5)
+    planes[~sheet.vertex[at], 4] = np.nan
+    z = np.nan_to_num(sheet.depth[: 2 * height, : 2 * width], nan=0.0).reshape(height, 2, width, 2)
+    box = np.zeros(4, dtype=np.int64)
+    some = (quads & TARGET) > 0
+    if some.any():
+        v, u = np.flatnonzero(some.any(axis=1)), np.flatnonzero(some.any(axis=0))
+        box[:] = (
+            max(v[0] - MARGIN, 0),
+            min(v[-1] + MARGIN, height),
+            max(u[0] - MARGIN, 0),
+            min(u[-1] + MARGIN, width),
+        )
+    return {
+        "depth": np.where(corner, sheet.depth[at], np.nan).astype(np.float32),
+        "quads": quads,
+        "planes": planes,
+        "free": minimum_filter(z.min(axis=(1, 3)), 3, mode="constant").astype(np.float32),
+        "boxes": box,
+    }
+
+
+def _correlated(depth: Float64, planes: Float64, residual: Float64, camera: Camera) -> float:
+    """Count the pixels whose noise is one: of noise that a Gaussian window correlates, from its correlation at a lag."""
+    height, width = residual.shape
+    flat = np.isfinite(residual)
+    products, squares = 0.0, 0.0
+    for rows in (slice(0, None, 8), slice(4, None, 8)):
+        rays = camera.rays[: 2 * height : 2, : 2 * width : 2][rows]
+        off = 1 / depth[: 2 * height : 2, : 2 * width : 2][rows] - np.einsum(
+            "hwc,hwc->hw", planes[rows], rays
+        )
+        off = np.where(flat[rows] & (np.abs(off) < 4 * residual[rows]), off, np.nan)
+        pair = off[:, 1:] * off[:, :-1]  # neighbours of cells are two pixels apart
+        products += float(np.nansum(pair))
+        squares += float(
+            np.nansum(np.where(np.isnan(pair), np.nan, (off[:, 1:] ** 2 + off[:, :-1] ** 2) / 2))
+        )
+    share = products / squares if squares > 0 else 0.0
+    if not 0 < share < 1:
+        return 1.0
+    return float(np.clip(-np.pi * CORRELATED_LAG**2 / np.log(share), 1.0, MOST))
+
+
+def _samples(planes: NDArray[np.float32], quads: NDArray[np.uint8], camera: Camera, seed: int) -> Samples:
+    """Draw planes from all directions that the surface has, each as often as the others."""
+    rng = np.random.default_rng(seed)
+    height, width = planes.shape[:2]
+    kind = np.zeros((height, width), dtype=np.uint8)
+    kind[:-1, :-1] = quads
+    rays = camera.rays[0 : 2 * height : 2, 0 : 2 * width : 2] + 0.5 / np.array([camera.fx, camera.fy, np.inf])
+    good = ((kind & INNER) > 0) & (planes[..., 4] > 0)
+    points, normals, sigmas, targets = [], [], [], []
+    for target, wanted in zip((True, False), PLACES, strict=True):
+        at = np.flatnonzero(good.ravel() & (((kind & TARGET) > 0).ravel() == target))
+        if not len(at):
+            continue
+        m = planes.reshape(-1, 5)[at].astype(np.float64)
+        size = np.linalg.norm(m[:, :3], axis=1)
+        n = -m[:, :3] / size[:, None]
+        bucket = np.unique(np.rint(3 * n).astype(np.int64) @ [1, 10, 100], return_inverse=True)[1]
+        often = np.bincount(bucket)[bucket]
+        picked = rng.choice(len(at), min(wanted, len(at)), replace=False, p=1 / often / (1 / often).sum())
+        picked.sort()
+        r = rays.reshape(-1, 3)[at[picked]]
+        z = 1 / np.einsum("mc,mc->m", m[picked, :3], r)
+        points.append(z[:, None] * r)
+        normals.append(n[picked])
+        sigmas.append(z * m[picked, 4] / size[picked])
+        targets.append(np.full(len(picked), target))
+    if not points:
+        return Samples(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=bool))
+    return Samples(*(np.concatenate(a) for a in (points, normals, sigmas, targets)))
+
+
+def fused(
+    surface: Surface, own: int, rig: Rig, camera: Camera, seen: Projection, edge_pixels: int, far: float
+) -> tuple[Projection, Float64, NDArray[np.int8]]:
+    """Fuse the scene's surface into a view's image.
+
+    ``seen`` is what the view's own stereo camera shows there. Where no other view measured anything it stays.
+
+    Returns the projection, the standard deviation of its depth (H, W), metres, and the number of views (H, W) that it is made
+    of, negative without the own one.
+    """
+    clouds, members = surface.clouds(), surface.members(own)
+    rays = camera.rays
+    T_tof_stereo = rig.T_tof_stereo @ invert(surface.poses[own]) @ surface.poses
+    grid = rig.stereo
+    eye = np.array([grid.fx, grid.fy, grid.cx, grid.cy])
+    x, y = (np.ascontiguousarray(r[::2]) for r in (grid.rays[0, :, 0], grid.rays[:, 0, 1]))
+    depth, normals, occluded = seen.depth.copy(), seen.normals.copy(), seen.occluded.copy()
+    doubtful, others = np.zeros((2, *camera.shape), dtype=bool)
+    sigma, views = np.full(camera.shape, np.nan), np.zeros(camera.shape, dtype=np.int8)
+    window = np.s_[:, :] if len(members) == 1 else _window(surface, own, rig, camera)
+    part = np.ascontiguousarray(rays[window].reshape(-1, 3))
+    hits = Hits.none(len(T_tof_stereo), len(part))
+    for k in members.tolist():
+        floor = surface.pose_sigma[own, k]
+        top, bottom, left, right = clouds.boxes[k].tolist()
+        if k == own:
+            z, place = seen.depth[window], seen.pixels[window] / 2
+        elif top < bottom:
+            box = np.s_[top:bottom, left:right]
+            cut = (clouds.quads[k, top : bottom - 1, left : right - 1] & SURFACE) > 0
+            z, place = _met(
+                clouds.depth[k][box], cut, x[left:right], y[top:bottom], T_tof_stereo[k], camera, window, far
+            )
+            place = place + np.array([left, top])
+        else:
+            continue
+        meet(hits, k, z.ravel(), place.reshape(-1, 2), clouds, T_tof_stereo[k], part, floor)
+    near, clear = _entry(surface, own, rig, part), ~seen.occluded[window].ravel()
+    found = fuse(hits, members, own, clouds, T_tof_stereo, eye, part, near, clear)
+    shape = others[window].shape
+    more = (np.isfinite(hits.depth).sum(axis=0) > np.isfinite(hits.depth[own])).reshape(shape)
+    others[window] = more
+    depth[window] = np.where(more, found.depth.reshape(shape), depth[window])
+    normals[window] = np.where(more[..., None], found.normals.reshape(*shape, 3), normals[window])
+    occluded[window] = np.where(more, found.occluded.reshape(shape), occluded[window])
+    doubtful[window] = more & found.doubtful.reshape(shape)
+    sigma[window], views[window] = found.sigma.reshape(shape), found.views.reshape(shape)
+    edge = np.where(others, edges(depth, camera, edge_pixels) | doubtful, seen.edge)
+    return Projection(depth, seen.pixels, normals, occluded, edge), sigma, views
+
+
+def _window(surface: Surface, own: int, rig: Rig, camera: Camera) -> tuple[slice, slice]:
+    """Rows and columns of a view's image that may show the object."""
+    low, high = surface.bounds[surface.group[own]]
+    corners = np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    )
+    p = transform_points(rig.T_tof_stereo @ invert(surface.poses[own]), corners)
+    if not (p[:, 2] > 0).all():
+        return np.s_[: camera.height, : camera.width]
+    at = camera.project(p)[0]
+    (left, top), (right, bottom) = (
+        np.floor(at.min(axis=0)).astype(int),
+        np.ceil(at.max(axis=0)).astype(int) + 1,
+    )
+    return np.s_[max(top, 0) : max(bottom, 1), max(left, 0) : max(right, 1)]
+
+
+def _entry(surface: Surface, own: int, rig: Rig, rays: Float64) -> Float64:
+    """Depth at which rays (P, 3) of a view enter the box about the object, metres."""
+    T_base_tof = surface.poses[own] @ invert(rig.T_tof_stereo)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        walls = (surface.bounds[surface.group[own], :, None] - T_base_tof[:3, 3]) / rotate_vectors(
+            T_base_tof, rays
+        )
+    return np.asarray(walls.min(axis=0).max(axis=-1))
+
+
+def _met(
+    depth: NDArray[np.float32], cut: NDArray[np.bool_], x: Float64, y: Float64, T: Float64, camera: Camera,
+    window: tuple[slice, slice], far: float,
+) -> tuple[Float64, Float64]:  # fmt: skip
+    """Find what the rays of a window of an image meet of one view's surface; a lens's are those of the nearest finer pixels."""
+    rays = camera.rays[window]
+    finer = LENS_FINER if camera.distortion else 1
+    low, high = rays[..., :2].min(axis=(0, 1)), rays[..., :2].max(axis=(0, 1))
+    focal = finer * np.array([camera.fx, camera.fy])
+    width, height = (np.rint((high - low) * focal).astype(int) + 1).tolist()
+    eye = Camera(width, height, *focal.tolist(), *(-low * focal).tolist())
+    z, place = place_hits(depth, cut, x, y, T, eye, far)
+    if finer == 1:
+        return z, place
+    u, v = np.rint(eye.project(rays)[0]).astype(np.intp).transpose(2, 0, 1)
+    return z[v, u], place[v, u]

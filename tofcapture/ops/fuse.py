@@ -1,0 +1,307 @@
+"""Fuse what all views' stereo cameras measured of a scene into the ground truth of one view, with its standard deviation.
+
+Along a ray of the target camera every view's surface gives a depth, or none. The nearest depth wins that is not refuted: one
+view's surface is refuted where more views see past it than agree with it, as they do with wrong points at edges. All depths
+that agree are averaged by stereo's own noise. A depth counts as seen only where every place on the ray before it is empty,
+by one view or another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofcapture.libraries import compiled
+
+Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+SURFACE, INNER, TARGET = 1, 2, 4  # bits of a quad: surface; away from where it is cut; of the scene's object
+WITHIN = 4.0  # standard deviations by which a triangle may miss the plane through its surroundings
+GRAZING_COSINE = 0.25882  # cos 75 deg
+AGREE = 4.0  # standard deviations, and
+AGREE_M = 0.0004  # m; two surfaces further apart are two
+PAST = 0.003  # m; a view sees past a point that is so much nearer than what it saw
+FLOOR = 5e-6  # m; what planes leave out, and no average takes away
+STEP = 0.004  # m, between places on a ray that must be empty
+CLEAR = 0.005  # m; the last of them before the surface
+CHANCE = 2.0  # times its mean; so large the scatter of a few depths may be without being an error
+LEAST_SLOPE = 0.02  # metres along the normal for a metre of depth; surfaces that are seen more from their side are edges
+UNFLAT = 1.5  # times the noise, where no plane fits
+
+
+@dataclass(frozen=True)
+class Clouds:
+    """Hold what the stereo cameras of N views measured, on (h, w) cells of 2 x 2 pixels of their grids.
+
+    Pixel (u, v) lies in cell (u // 2, v // 2), whose depth is that of its first pixel.
+    """
+
+    depth: Float32  #: (N, h, w) metres; NaN: no corner of a surface.
+    quads: NDArray[np.uint8]  #: (N, h-1, w-1) bits SURFACE, INNER, TARGET between cells.
+    #: (N, h, w, 5) m with ``m . p = 1`` of planes, the deviation of a point's inverse depth, and the plane's own, NaN: not flat.
+    planes: Float32
+    free: Float32  #: (N, h, w) metres up to which space is known to be empty about a cell; 0: unknown.
+    boxes: NDArray[np.intp]  #: (N, 4) first and last row and column of cells about the object.
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Hold what the rays of P pixels meet in each of N views."""
+
+    depth: Float32  #: (N, P) metres; NaN: nothing.
+    sigma: Float32  #: (N, P) metres along the surface's normal; negative where it is not to be trusted.
+    cell: NDArray[np.int32]  #: (N, P) number of the cell of the view's plane.
+
+    @staticmethod
+    def none(views: int, pixels: int) -> Hits:
+        """Return hits of nothing."""
+        nothing = np.full((views, pixels), np.nan, dtype=np.float32)
+        return Hits(nothing, nothing.copy(), np.zeros((views, pixels), dtype=np.int32))
+
+
+@dataclass(frozen=True)
+class Fused:
+    """Hold the fused surface at P pixels."""
+
+    depth: Float64  #: (P,) metres; NaN: none.
+    normals: Float64  #: (P, 3) unit, facing the camera.
+    sigma: Float64  #: (P,) metres, one standard deviation of depth.
+    views: NDArray[
+        np.int8
+    ]  #: (P,) how many views it is made of; negative where the target's own is not among them.
+    doubtful: Bool  #: (P,) made of points that no view is sure of.
+    occluded: Bool  #: (P,) the way there is not known to be empty.
+
+
+def meet(
+    hits: Hits, view: int, depth: Float64, pixels: Float64, clouds: Clouds, T_target_stereo: Float64, rays: Float64,
+    floor: float,
+) -> None:  # fmt: skip
+    """Put into ``hits`` what the target's rays (P, 3) meet of one view.
+
+    ``depth`` (P,) and ``pixels`` (P, 2), counted in cells, are what :func:`tofcapture.ops.project.place_hits` found. ``floor``, metres, is the
+    standard deviation of the view's surface through its pose.
+    """
+    _meet(
+        depth, pixels, clouds.planes[view], clouds.quads[view], T_target_stereo, rays, floor,
+        hits.depth[view], hits.sigma[view], hits.cell[view],
+    )  # fmt: skip
+
+
+def fuse(
+    hits: Hits,
+    members: NDArray[np.intp],
+    own: int,
+    clouds: Clouds,
+    T_target_stereo: Float64,
+    eye: Float64,
+    rays: Float64,
+    near: Float64,
+    clear: Bool,
+) -> Fused:
+    """Fuse the hits of the views that are members.
+
+    ``own`` is the target's own view, ``T_target_stereo`` (N, 4, 4), ``eye`` fx, fy, cx, cy of the stereo grid. Up to ``near``
+    (P,) metres deep there is nothing; the own view saw that there is nothing before its hit where it is ``clear`` (P,).
+    """
+    pixels = hits.depth.shape[1]
+    out = Fused(
+        np.full(pixels, np.nan),
+        np.full((pixels, 3), np.nan),
+        np.full(pixels, np.nan),
+        np.zeros(pixels, dtype=np.int8),
+        np.zeros(pixels, dtype=bool),
+        np.zeros(pixels, dtype=bool),
+    )
+    back = np.stack([_inverse(T) for T in T_target_stereo])
+    _fuse(
+        hits.depth, hits.sigma, hits.cell, members, own, clouds.planes, clouds.free, T_target_stereo, back, eye, rays, near, clear,
+        out.depth, out.normals, out.sigma, out.views, out.doubtful, out.occluded,
+    )  # fmt: skip
+    return out
+
+
+def _inverse(T: Float64) -> Float64:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
+    return out
+
+
+@compiled
+def _meet(
+    depth: Float64, pixels: Float64, planes: Float32, quads: NDArray[np.uint8], pose: Float64, rays: Float64, floor: float,
+    out: Float32, sigma: Float32, cell: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Move hits onto the planes that fit about them, as those of one view alone are, and say how sure each is."""
+    height, width = planes.shape[:2]
+    m = np.empty(3)
+    for i in range(len(depth)):
+        z = depth[i]
+        if not z > 0:
+            continue
+        u, v = pixels[i, 0], pixels[i, 1]
+        column, row = min(int(u + 0.25), width - 1), min(int(v + 0.25), height - 1)
+        plane = planes[row, column]
+        for k in range(3):
+            m[k] = pose[k, 0] * plane[0] + pose[k, 1] * plane[1] + pose[k, 2] * plane[2]
+        along = m[0] * rays[i, 0] + m[1] * rays[i, 1] + m[2] * rays[i, 2]
+        size = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+        own_z, distance = 0.0, 0.0  # in the view's own frame
+        for k in range(3):
+            offset = z * rays[i, k] - pose[k, 3]
+            own_z += pose[k, 2] * offset
+            distance += offset * offset
+        cell[i], out[i] = row * width + column, z
+        if not along > 0:
+            sigma[i] = -1e-3
+            continue
+        error = own_z * plane[3] / size  # of one point, along the normal
+        there = (1 + m[0] * pose[0, 3] + m[1] * pose[1, 3] + m[2] * pose[2, 3]) / along
+        if plane[4] > 0 and abs(there - z) * along / size <= WITHIN * error:
+            out[i], error = there, own_z * plane[4] / size
+        else:
+            error *= UNFLAT
+        trusted = (
+            quads[min(int(v), height - 2), min(int(u), width - 2)] & INNER
+            and 1 / (size * np.sqrt(distance)) > GRAZING_COSINE
+        )
+        sigma[i] = np.sqrt(error * error + floor * floor) * (1.0 if trusted else -1.0)
+
+
+@compiled
+def _empty(free: Float32, back: Float64, eye: Float64, x: float, y: float, z: float, beyond: float) -> bool:
+    """Tell whether a view sees so far past a point of the target's frame."""
+    own = back[2, 0] * x + back[2, 1] * y + back[2, 2] * z + back[2, 3]
+    if not own > 0:
+        return False
+    u = eye[0] * (back[0, 0] * x + back[0, 1] * y + back[0, 2] * z + back[0, 3]) / own + eye[2]
+    v = eye[1] * (back[1, 0] * x + back[1, 1] * y + back[1, 2] * z + back[1, 3]) / own + eye[3]
+    height, width = free.shape
+    if not (0 <= u < 2 * width and 0 <= v < 2 * height):
+        return False
+    return free[int(v) // 2, int(u) // 2] - own > beyond  # type: ignore[no-any-return]
+
+
+@compiled
+def _fuse(
+    depth: Float32, sigma: Float32, cell: NDArray[np.int32], members_of: NDArray[np.intp], own: int, planes: Float32, free: Float32,
+    poses: Float64, backs: Float64, eye: Float64, rays: Float64, near: Float64, clear: Bool,
+    out: Float64, normals: Float64, deviation: Float64, views: NDArray[np.int8], doubtful: Bool, occluded: Bool,
+) -> None:  # fmt: skip
+    """Fuse the hits (N, P) of all pixels; see :func:`fuse`."""
+    count, pixels = depth.shape
+    width = planes.shape[2]
+    order, member, slope = np.empty(count, np.int64), np.empty(count, np.bool_), np.empty(count)
+    m = np.empty(3)
+    for i in range(pixels):
+        found = 0
+        for j in range(count):
+            if depth[j, i] > 0:
+                order[found] = j
+                found += 1
+        for a in range(1, found):  # by insertion: they are few
+            j, b = order[a], a
+            while b > 0 and depth[order[b - 1], i] > depth[j, i]:
+                order[b] = order[b - 1]
+                b -= 1
+            order[b] = j
+        if not found:
+            continue
+        x, y, w = rays[i, 0], rays[i, 1], rays[i, 2]
+        for a in range(found):  # metres along the normal for a metre of depth
+            j = order[a]
+            plane, pose = planes[j, cell[j, i] // width, cell[j, i] % width], poses[j]
+            size = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
+            along = 0.0
+            for k in range(3):
+                along += rays[i, k] * (pose[k, 0] * plane[0] + pose[k, 1] * plane[1] + pose[k, 2] * plane[2])
+            slope[j] = max(along / size, LEAST_SLOPE)
+        for first in range(found):
+            begin = order[first]
+            members, sure = 0, 0
+            for a in range(found):
+                j = order[a]
+                apart = abs(depth[j, i] - depth[begin, i]) * min(slope[j], slope[begin])
+                member[j] = apart < AGREE * np.sqrt(sigma[j, i] ** 2 + sigma[begin, i] ** 2) + AGREE_M
+                members += member[j]
+                sure += member[j] and sigma[j, i] > 0
+            z = float(depth[begin, i])
+            past = 0
+            for j in members_of[: 0 if 2 * members >= len(members_of) else len(members_of)]:
+                past += _empty(free[j], backs[j], eye, z * x, z * y, z * w, PAST)
+            if past > members:
+                continue
+            _average(depth[:, i], sigma[:, i], order[:found], member, slope, sure > 0, i, out, deviation)
+            # The normal of the planes that the depth is made of.
+            m[:] = 0
+            views[i], has_own = 0, False
+            for a in range(found):
+                j = order[a]
+                if member[j] and (sigma[j, i] > 0 or not sure):
+                    views[i] += 1
+                    has_own |= j == own
+                    plane, pose = planes[j, cell[j, i] // width, cell[j, i] % width], poses[j]
+                    size = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
+                    weight = 1 / (size * sigma[j, i] ** 2)
+                    if slope[j] > LEAST_SLOPE:  # those that face away say nothing
+                        for k in range(3):
+                            m[k] -= weight * (
+                                pose[k, 0] * plane[0] + pose[k, 1] * plane[1] + pose[k, 2] * plane[2]
+                            )
+            size = np.sqrt(m[0] ** 2 + m[1] ** 2 + m[2] ** 2)
+            if size == 0:
+                m[0], m[1], m[2], size = -x, -y, -w, np.sqrt(x * x + y * y + w * w)
+            for k in range(3):
+                normals[i, k] = m[k] / size
+            views[i] = views[i] if has_own else -views[i]
+            doubtful[i] = sure == 0
+            last, z = own, out[i] - CLEAR
+            while z > near[i] and not (has_own and clear[i]):
+                empty = _empty(free[last], backs[last], eye, z * x, z * y, z * w, 0.0)
+                for j in members_of:
+                    if empty:
+                        break
+                    empty = _empty(free[j], backs[j], eye, z * x, z * y, z * w, 0.0)
+                    if empty:
+                        last = j
+                if not empty:
+                    occluded[i] = True
+                    break
+                z -= STEP
+            break
+
+
+@compiled
+def _average(
+    depth: Float32, sigma: Float32, order: NDArray[np.int64], member: Bool, slope: Float64, sure: bool, pixel: int,
+    out: Float64, deviation: Float64,
+) -> None:  # fmt: skip
+    """Average the members' depths by their noise; one that is far from the others counts less."""
+    mean, error = 0.0, 0.0
+    for turn in range(3):
+        total, weights, squares, count = 0.0, 0.0, 0.0, 0
+        for j in order:
+            if member[j] and (sigma[j] > 0 or not sure):
+                s = sigma[j] / slope[j]  # along the ray
+                weight = 1 / (s * s)
+                off = (depth[j] - mean) / s
+                if turn:
+                    weight /= max(1.0, abs(off) / 2)
+                total += weight * depth[j]
+                weights += weight
+                squares += weight * off * off * s * s
+                count += 1
+        mean = total / weights
+        error = 1 / weights
+        if turn and count > 1:  # scatter beyond what noise may leave is error too
+            error *= max(1.0, squares / (count - 1) / CHANCE)
+    steepest = 1.0
+    for j in order:
+        if member[j]:
+            steepest = min(steepest, slope[j])
+    out[pixel] = mean
+    deviation[pixel] = np.sqrt(error + (FLOOR / steepest) ** 2)
