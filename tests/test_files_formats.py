@@ -91,7 +91,7 @@ def test_the_layouts_are_pinned():
     def summary(layout):
         return {f.path: f"{'|'.join(f.dtypes)} {' '.join(f.dims)}{' ?' * f.optional}".strip() for f in layout}
 
-    arm = {"joints": "float64 6", "T_base_flange": "float64 4 4", "time_ns": "int64"}
+    arm = {"joints": "float64 J", "T_base_flange": "float64 4 4", "time_ns": "int64"}
     assert (VIEW.format, VIEW.version) == ("tofcapture-view", 1)
     assert summary(VIEW) == {
         "tof/raw": "uint16|int16|float64 F K H W",

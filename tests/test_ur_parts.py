@@ -20,13 +20,14 @@ from tests.ur_emulator.robot import PLAYING, Robot
 from tests.ur_emulator.rtde_server import pack
 from tests.ur_emulator.script import ControlScript
 from tofcapture.devices import faults
+from tofcapture.devices.arm.limits import check_goal, check_way, joint_speed
 from tofcapture.devices.clearance import body_of, workcell_of
 from tofcapture.devices.kinematics import HOME
 from tofcapture.devices.station import DEFAULT, open_station
 from tofcapture.devices.ur_rtde import link as wire
 from tofcapture.devices.ur_rtde import probe as probing
-from tofcapture.devices.ur_rtde.limits import check_goal, check_way, joint_speed, read_settings
 from tofcapture.devices.ur_rtde.link import danger, halted
+from tofcapture.devices.ur_rtde.settings import read_settings
 from tofcapture.errors import ConfigError, DeviceError, MotionRefused
 
 SETTINGS = read_settings({"host": "127.0.0.1"})

@@ -135,9 +135,7 @@ class ArmInfo:
 class ArmState:
     """Tell where the arm says it is."""
 
-    joints: (
-        Float64  #: (6,) measured joint angles, radians; NaN: there is no arm, somebody else says the pose.
-    )
+    joints: Float64  #: (J,) measured joint angles, radians, as many as the arm has; NaN: there is no arm, somebody else says the pose.
     T_base_flange: Float64  #: (4, 4), from the measured joints.
     time_ns: int  #: int, monotonic clock.
 

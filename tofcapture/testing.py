@@ -57,7 +57,7 @@ def check_arm(
 ) -> None:
     """Put an arm through the contract.
 
-    It moves: by 0.02 rad in its first joint, or to ``goal`` (6,) rad, reachable from where it stands, and back. ``kinematics``
+    It moves: by 0.02 rad in its first joint, or to ``goal`` (J,) rad, reachable from where it stands, and back. ``kinematics``
     are those of the station's ``[arm.kinematics]``, for a driver that brings none.
     """
     arm = _made(make, "arm")
@@ -73,7 +73,11 @@ def check_arm(
         before = _check_state(arm)
         wrong = pose_error(model, before.joints, before.T_base_flange)
         _require(not wrong, "the kinematics lead from the measured joints to the measured pose", wrong)
-        there = before.joints + np.eye(6)[0] * _NUDGE if goal is None else np.asarray(goal, dtype=np.float64)
+        there = (
+            before.joints + _NUDGE * (np.arange(len(before.joints)) == 0)
+            if goal is None
+            else np.asarray(goal, dtype=np.float64)
+        )
         arm.check_move(before.joints, there)
         _check_moves(arm, before.joints, there)
         _check_refusals(arm)
@@ -279,11 +283,12 @@ def _check_stop(arm: Any, goal: Float64, home: Float64) -> None:
 
 def _check_refusals(arm: Any) -> None:
     before = arm.state().joints
+    count = len(before)
     bad = {
-        "NaN": np.full(6, np.nan),
-        "infinite angles": np.full(6, np.inf),
-        "five angles": np.zeros(5),
-        "an angle of 100 rad": np.full(6, 100.0),
+        "NaN": np.full(count, np.nan),
+        "infinite angles": np.full(count, np.inf),
+        "an angle too few": np.zeros(count - 1),
+        "an angle of 100 rad": np.full(count, 100.0),
     }
     for what, joints in bad.items():
         clause = f"move_to refuses {what} by MotionRefused"

@@ -256,7 +256,7 @@ def _probe_arm(context: Any, workcell: Any) -> Iterator[Finding]:
         hits = obstacles(model, rig, workcell, workcell.home)
         if met := [reason for reason, hit in zip(REASONS, hits, strict=True) if hit]:
             raise ConfigError(
-                f"[plan] home is not clear: {', '.join(met)}", hint="choose another: six angles in radians"
+                f"[plan] home is not clear: {', '.join(met)}", hint="choose another: angles in radians"
             )
         return f"{model.name}; home is clear"
 

@@ -90,7 +90,7 @@ class Arm(Device, Protocol):
         return arm_model(self.describe().model)
 
     def check_move(self, start: Float64, goal: Float64) -> None:
-        """Check a straight motion in joint space, (6,) to (6,) radians, as ``move_to`` will; nothing moves.
+        """Check a straight motion in joint space, (J,) to (J,) radians, as ``move_to`` will; nothing moves.
 
         Plans are made, and dry runs proved, with it. An arm that takes any motion leaves it out.
 
@@ -111,7 +111,7 @@ class Arm(Device, Protocol):
         ...
 
     def move_to(self, joints: Float64) -> ArmState:
-        """Move to joint angles (6,) in radians, wait until settled, return the measured state.
+        """Move to joint angles (J,) in radians, wait until settled, return the measured state.
 
         Raises :class:`MotionRefused`: the goal is outside the limits or the arm refuses.
         """

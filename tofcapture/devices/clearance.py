@@ -28,7 +28,7 @@ _MOST = np.radians(149.0)  # largest turn of a joint in one motion: a change of 
 WRIST = 3  # last pieces of the arm, on which the rig is mounted; as many next to each other cannot meet
 
 _SHAPES = {
-    "target": (3,), "board": (3,), "board_normal": (3,), "home": (6,), "tof_box": (2, 3), "stereo_box": (2, 3),
+    "target": (3,), "board": (3,), "board_normal": (3,), "tof_box": (2, 3), "stereo_box": (2, 3),
 }  # fmt: skip  # the others are numbers
 
 REASONS = ("table", "object", "base", "self")
@@ -49,7 +49,7 @@ class Workcell:
     board_normal: Float64  # (3,) the direction that the board's front faces
     keep_out_radius: float = 0.30  # of an upright cylinder about the target
     keep_out_height: float = 0.30  # of it, above the table
-    home: Float64 = field(default_factory=HOME.copy)  # (6,) rad; from there every view is reached
+    home: Float64 = field(default_factory=HOME.copy)  # (J,) rad; from there every view is reached
     # (2, 3) corners of each camera's housing in its own frame; the stereo one's is that of an Ensenso N35, left eye in front
     tof_box: Float64 = field(default_factory=_box((-0.05, -0.05, -0.06), (0.05, 0.05, 0.01)))
     stereo_box: Float64 = field(default_factory=_box((-0.04, -0.03, -0.05), (0.14, 0.03, 0.01)))
@@ -68,7 +68,7 @@ def workcell_of(config: Mapping[str, Any]) -> Workcell:
             f"station: [plan]: {err}", hint="see the comments of the embedded station.toml"
         ) from err
     for key, v in values.items():
-        shape = _SHAPES.get(key, ())
+        shape = (max(v.size, 6),) if key == "home" else _SHAPES.get(key, ())
         if v.shape != shape or not np.isfinite(v).all():
             wanted = f"{' x '.join(map(str, shape))} finite numbers" if shape else "a finite number"
             raise ConfigError(f"station: [plan] {key}: expected {wanted}, got {v.tolist()}")
@@ -98,10 +98,10 @@ class Body:
 
 
 def body_of(model: ArmModel, rig: Rig, workcell: Workcell, joints: NDArray[np.floating]) -> Body:
-    """Find where arm and rig are at joint angles (..., 6), radians."""
+    """Find where arm and rig are at joint angles (..., J), radians."""
     frames = joint_frames(model, joints)
     arm = _placed(frames[..., model.frames, :, :], model.metal)
-    flange = frames[..., 6, :, :] @ model.fixed[6]
+    flange = frames[..., -1, :, :] @ model.fixed[-1]
     mounts = [check_transform(T) for T in (rig.T_flange_tof, rig.T_flange_stereo)]
     boxes = [_capsule(box) for box in (workcell.tof_box, workcell.stereo_box)]
     pieces = [_placed(T[None], ends[None])[0] for T, (ends, _) in zip(mounts, boxes, strict=True)]
@@ -128,12 +128,12 @@ def _capsule(box: Float64) -> tuple[Float64, float]:
 def obstacles(
     model: ArmModel, rig: Rig, workcell: Workcell, joints: NDArray[np.floating], air: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Say what is in the way at joint angles (..., 6), radians, with ``air`` metres more room.
+    """Say what is in the way at joint angles (..., J), radians, with ``air`` metres more room.
 
     Returns (..., 4), one per entry of :data:`REASONS`. What the table, the object or the base are in the way of is not looked at
     for itself.
     """
-    flat = np.asarray(joints, dtype=np.float64).reshape(-1, 6)
+    flat = np.asarray(joints, dtype=np.float64).reshape(-1, model.joints)
     body = body_of(model, rig, workcell, flat)
     moving = np.concatenate([body.arm[:, 1:], body.rig], axis=1)
     thick = np.append(body.radii[0][1:], body.radii[1]) + air
@@ -210,7 +210,7 @@ def segment_in_box(segments: Float64, low: Float64, high: Float64) -> NDArray[np
 
 
 def straight_way(start: Float64, goal: Float64, step: float) -> Float64:
-    """Joint angles (N, 6) along the straight way in joint space, ``step`` radians apart at most, both ends included."""
+    """Joint angles (N, J) along the straight way in joint space, ``step`` radians apart at most, both ends included."""
     count = max(2, int(np.ceil(np.abs(goal - start).max() / step)) + 1)
     way: Float64 = start + (goal - start) * np.linspace(0, 1, count)[:, None]
     return way
@@ -219,7 +219,7 @@ def straight_way(start: Float64, goal: Float64, step: float) -> Float64:
 def is_clear(
     model: ArmModel, rig: Rig, workcell: Workcell, start: Float64, goal: Float64, air: float = 0.0
 ) -> bool:
-    """Tell whether the straight way in joint space from (6,) to (6,) is allowed.
+    """Tell whether the straight way in joint space from (J,) to (J,) is allowed.
 
     It meets nothing, ends within the joint limits, and turns no joint by more than 149 deg.
     """
@@ -231,7 +231,7 @@ def is_clear(
 def route(
     model: ArmModel, rig: Rig, workcell: Workcell, start: Float64, goal: Float64, check: Check | None = None
 ) -> list[Float64]:
-    """Goals (6,) to visit one after the other: straight if nothing is in the way, else by way of home.
+    """Goals (J,) to visit one after the other: straight if nothing is in the way, else by way of home.
 
     ``check`` is the arm's own, as :meth:`tofcapture.devices.Arm.check_move`. Raises MotionRefused when neither way is clear.
     """

@@ -107,8 +107,8 @@ def _of_points(frame: Any, info: StereoInfo) -> Iterator[Promise]:
 def _of_state(state: Any) -> Iterator[Promise]:
     yield isinstance(state, ArmState), "[arm] state() returns an ArmState", type(state), "another object"
     joints, away = np.asarray(state.joints), np.abs(state.T_base_flange[:3, 3]).max()
-    whole = joints.shape == (6,) and (np.isfinite(joints).all() or np.isnan(joints).all())
-    yield whole, "[arm] joints are 6 finite angles, or NaN where there are none", joints, "another number of axes"
+    whole = joints.ndim == 1 and len(joints) >= 6 and (np.isfinite(joints).all() or np.isnan(joints).all())
+    yield whole, "[arm] joints are finite angles, 6 or more, or NaN where there are none", joints, "another number of axes"
     yield not np.abs(joints).max() >= _TURN, "[arm] joints are in radians", joints, "the driver gives degrees"
     yield away < 5, "[arm] T_base_flange is in metres", f"{away:g}", "the driver gives millimetres"
     yield isinstance(state.time_ns, int), "[arm] time_ns is a whole number", state.time_ns, "seconds as floats"

@@ -1,4 +1,4 @@
-"""Kinematics of six-axis arms: forward for any, inverse in closed form for those of Universal Robots, by iteration for others.
+"""Kinematics of arms of six turning joints or more: forward for any, inverse in closed form for those of Universal Robots, by iteration for others.
 
 Standard Denavit-Hartenberg: ``T_{i-1,i} = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i)``; UR arms have alpha = 90, 0, 0, 90, -90, 0 deg. Their
 constants are the manufacturer's nominal ones (support article "DH parameters for calculations of kinematics and
@@ -30,7 +30,8 @@ _ELBOW = np.radians(160.0)  # of a UR, to either side; beyond it the forearm's e
 _MODEL_ERROR = (0.01, np.radians(1.5))  # m, rad; an arm that is farther off is another one
 # Of the iteration: starts for each pose, steps, and the error (m, rad) at its end
 _STARTS, _ROUNDS, _FOUND = 4, 40, 1e-9
-_TURN = (-2 * np.pi,) * 6, (2 * np.pi,) * 6
+_TURN = 2 * np.pi  # unless a joint's limits are known
+_LEAST = 6  # joints that hold any pose
 
 
 class Offsets(NamedTuple):
@@ -42,17 +43,22 @@ class Offsets(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """Nominal geometry of an arm with six revolute joints."""
+    """Nominal geometry of an arm of J revolute joints, six or more."""
 
     name: str
-    fixed: Float64  # (7, 4, 4) ``T_base_joint1``, then from each joint's turned frame to the next; the last gives the flange
-    low: Float64  # (6,) joint limits, radians
+    fixed: Float64  # (J + 1, 4, 4) ``T_base_joint1``, then from each joint's turned frame to the next; the last gives the flange
+    low: Float64  # (J,) joint limits, radians
     high: Float64
     frames: NDArray[np.intp]  # (S,) to which joint's frame a piece of metal belongs; 0 is the base
     metal: Float64  # (S, 2, 3) its axis in that frame, metres
     radii: Float64  # (S,) of each piece, metres, larger than the real ones
     closed: Offsets | None = None  # a UR's constants
     speed: float = 0.5  # of joints while capturing, rad/s; far below the arm's limit
+
+    @property
+    def joints(self) -> int:
+        """Count the joints."""
+        return len(self.low)
 
 
 def wrap(angle: ArrayLike) -> Float64:
@@ -74,41 +80,47 @@ def _link(row: Float64, q: NDArray[np.floating]) -> Float64:
 
 
 def dh_model(
-    name: str, rows: ArrayLike, low: ArrayLike = _TURN[0], high: ArrayLike = _TURN[1], radius: float = 0.08
+    name: str, rows: ArrayLike, low: ArrayLike = -_TURN, high: ArrayLike = _TURN, radius: float = 0.08
 ) -> ArmModel:
     """Make the model of an arm from its standard Denavit-Hartenberg table.
 
-    Its rows (6, 4) are a, d in metres, alpha, theta in radians; theta is added to the joint's angle. See :func:`chain_model`.
+    Its rows (J, 4) are a, d in metres, alpha, theta in radians; theta is added to the joint's angle. See :func:`chain_model`.
     """
-    table = _numbers(rows, (6, 4), f"{name}: Denavit-Hartenberg rows of a, d, alpha, theta")
+    table = _numbers(rows, (-_LEAST, 4), f"{name}: Denavit-Hartenberg rows of a, d, alpha, theta")
     turns = [*(_link(np.zeros(3), theta) for theta in table[:, 3]), np.eye(4)]
     links = [np.eye(4), *(_link(row, np.zeros(())) for row in table[:, :3])]
     return chain_model(name, [a @ b for a, b in zip(links, turns, strict=True)], low, high, radius)
 
 
 def chain_model(
-    name: str, fixed: ArrayLike, low: ArrayLike = _TURN[0], high: ArrayLike = _TURN[1], radius: float = 0.08
+    name: str, fixed: ArrayLike, low: ArrayLike = -_TURN, high: ArrayLike = _TURN, radius: float = 0.08
 ) -> ArmModel:
-    """Make a model from transforms (7, 4, 4): base to first joint, from each turned joint to the next, last joint to flange.
+    """Make a model from transforms (J + 1, 4, 4): base to first joint, from each turned joint to the next, last joint to flange.
 
-    Its metal goes straight from joint to joint, ``radius`` metres thick. ``low`` and ``high`` (6,) are joint limits, radians.
+    Its metal goes straight from joint to joint, ``radius`` metres thick. ``low`` and ``high`` are joint limits, (J,) or one for all, radians.
     Raises ConfigError: another shape, or values that make no sense.
     """
-    links = _numbers(fixed, (7, 4, 4), f"{name}: transforms from joint to joint")
-    low, high = (_numbers(a, (6,), f"{name}: joint limits") for a in (low, high))
+    links = _numbers(fixed, (-_LEAST - 1, 4, 4), f"{name}: transforms from joint to joint")
+    low, high = (np.full(len(links) - 1, a) if np.ndim(a) == 0 else a for a in (low, high))
+    low, high = (_numbers(a, (len(links) - 1,), f"{name}: joint limits") for a in (low, high))
     if not ((low < high).all() and 0 < radius < 1):
         raise ConfigError(f"{name}: expected lower joint limits below upper ones and a radius of 0 to 1 m")
-    metal = np.stack([np.zeros((7, 3)), links[:, :3, 3]], axis=1)
-    return ArmModel(name, links, low, high, np.arange(7), metal, np.full(7, radius))
+    metal = np.stack([np.zeros((len(links), 3)), links[:, :3, 3]], axis=1)
+    return ArmModel(name, links, low, high, np.arange(len(links)), metal, np.full(len(links), radius))
 
 
 def _numbers(values: ArrayLike, shape: tuple[int, ...], what: str) -> Float64:
+    """Take finite numbers of a shape; a negative length stands for that many or more."""
     try:
         out = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
         out = np.empty(0)
-    if out.shape != shape or not np.isfinite(out).all():
-        raise ConfigError(f"{what}: expected {' x '.join(map(str, shape))} finite numbers, got {values!r}")
+    fits = out.ndim == len(shape) and all(
+        n >= -s if s < 0 else n == s for n, s in zip(out.shape, shape, strict=True)
+    )
+    if not fits or not np.isfinite(out).all():
+        wanted = " x ".join(f"{-s} or more" if s < 0 else str(s) for s in shape)
+        raise ConfigError(f"{what}: expected {wanted} finite numbers, got {values!r}")
     return out
 
 
@@ -163,13 +175,13 @@ def arm_model(name: str) -> ArmModel:
 
 
 def check_joints(model: ArmModel, joints: ArrayLike) -> Float64:
-    """Check a goal (6,) in radians; returns a copy, float64.
+    """Check a goal (J,) in radians; returns a copy, float64.
 
-    Raises :class:`MotionRefused`: not six finite angles, or one beyond the model's limit.
+    Raises :class:`MotionRefused`: not J finite angles, or one beyond the model's limit.
     """
     goal = np.array(joints, dtype=np.float64)
-    if goal.shape != (6,) or not np.isfinite(goal).all():
-        raise MotionRefused(f"move: expected 6 finite joint angles, got {goal.tolist()}")
+    if goal.shape != (model.joints,) or not np.isfinite(goal).all():
+        raise MotionRefused(f"move: expected {model.joints} finite joint angles, got {goal.tolist()}")
     beyond = np.maximum(model.low - goal, goal - model.high)
     worst = int(beyond.argmax())
     if beyond[worst] > 0:
@@ -191,13 +203,13 @@ def pose_error(model: ArmModel, joints: ArrayLike, T_base_flange: ArrayLike) -> 
 
 
 def joint_frames(model: ArmModel, q: ArrayLike) -> Float64:
-    """Frames ``T_base_joint`` (..., 7, 4, 4), metres, of joint angles (..., 6), radians: the base, then each joint's after its turn."""
+    """Frames ``T_base_joint`` (..., J + 1, 4, 4), metres, of joint angles (..., J), radians: the base, then each joint's after its turn."""
     q = np.asarray(q, dtype=np.float64)
-    if q.shape[-1:] != (6,):
-        raise ConfigError(f"joints: expected shape (..., 6), got {q.shape}")
-    out = np.empty((*q.shape[:-1], 7, 4, 4))
+    if q.shape[-1:] != (model.joints,):
+        raise ConfigError(f"joints: expected shape (..., {model.joints}) of the {model.name}, got {q.shape}")
+    out = np.empty((*q.shape[:-1], model.joints + 1, 4, 4))
     out[..., 0, :, :] = np.eye(4)
-    for i in range(6):
+    for i in range(model.joints):
         T = out[..., i, :, :] @ model.fixed[i]
         c, s = np.cos(q[..., i, None]), np.sin(q[..., i, None])
         out[..., i + 1, :, 0], out[..., i + 1, :, 1] = (
@@ -209,7 +221,7 @@ def joint_frames(model: ArmModel, q: ArrayLike) -> Float64:
 
 
 def link_frames(model: ArmModel, q: ArrayLike) -> Float64:
-    """Frames of all links, ``T_base_link`` (..., 6, 4, 4), metres, of joint angles (..., 6), radians.
+    """Frames of all links, ``T_base_link`` (..., J, 4, 4), metres, of joint angles (..., J), radians.
 
     The last one is the flange.
     """
@@ -218,7 +230,7 @@ def link_frames(model: ArmModel, q: ArrayLike) -> Float64:
 
 
 def forward(model: ArmModel, q: ArrayLike) -> Float64:
-    """Flange pose ``T_base_flange`` (..., 4, 4), metres, of joint angles (..., 6), radians."""
+    """Flange pose ``T_base_flange`` (..., 4, 4), metres, of joint angles (..., J), radians."""
     out: Float64 = link_frames(model, q)[..., -1, :, :]
     return out
 
@@ -260,9 +272,9 @@ def _elbow(ur: Offsets, T_1_4: Float64) -> tuple[Float64, Float64, Float64]:
 def inverse_all(model: ArmModel, T_base_flange: ArrayLike, near: ArrayLike = HOME) -> Float64:
     """Branches of the inverse kinematics of many poses (..., 4, 4), metres.
 
-    Returns (..., S, 6) float64 radians in [-pi, pi]; NaN rows where a branch cannot reach. For a UR the 8 of
+    Returns (..., S, J) float64 radians in [-pi, pi]; NaN rows where a branch cannot reach. For a UR the 8 of
     the closed form: shoulder left/right x wrist flip x elbow; at the wrist singularity (q5 = 0 or pi) q6 is
-    set to zero and both wrist branches coincide. For any other arm what is found from starts ``near`` (6,)
+    set to zero and both wrist branches coincide. For any other arm what is found from starts ``near`` (J,)
     and elsewhere: maybe not all there are.
     """
     T = np.asarray(T_base_flange, dtype=np.float64)
@@ -283,9 +295,9 @@ def inverse_all(model: ArmModel, T_base_flange: ArrayLike, near: ArrayLike = HOM
 
 
 def _iterated(model: ArmModel, T: Float64, near: Float64) -> Float64:
-    """(..., S, 6) by damped least squares (Levenberg) on the pose's error, from ``near`` and from random angles."""
+    """(..., S, J) by damped least squares (Levenberg) on the pose's error, from ``near`` and from random angles."""
     middle, half = (model.low + model.high) / 2, np.minimum((model.high - model.low) / 2, np.pi)
-    starts = np.random.default_rng(0).uniform(middle - half, middle + half, (_STARTS - 1, 6))
+    starts = np.random.default_rng(0).uniform(middle - half, middle + half, (_STARTS - 1, model.joints))
     goals = np.repeat(T.reshape(-1, 1, 4, 4), _STARTS, axis=1).reshape(-1, 4, 4)
     q = np.tile(np.vstack([near, starts]), (len(goals) // _STARTS, 1))
     reach = np.linalg.norm(model.fixed[:, :3, 3], axis=1).sum()
@@ -293,7 +305,7 @@ def _iterated(model: ArmModel, T: Float64, near: Float64) -> Float64:
     found = np.zeros(len(q), dtype=bool)
     for _ in range(_ROUNDS):
         frames = joint_frames(model, q[left])
-        now = frames[:, 6] @ model.fixed[6]
+        now = frames[:, -1] @ model.fixed[-1]
         error = _pose_error(now, goals[left])
         size = np.linalg.norm(error, axis=1)
         found[left[size < _FOUND]] = True
@@ -304,13 +316,12 @@ def _iterated(model: ArmModel, T: Float64, near: Float64) -> Float64:
         axes, places = frames[:, 1:, :3, 2], frames[:, 1:, :3, 3]
         J = np.concatenate([np.cross(axes, now[:, None, :3, 3] - places), axes], axis=2)  # rows are joints
         damping = 0.1 * np.minimum((error**2).sum(axis=1), 1.0)[:, None, None] * np.eye(6)
-        step = np.linalg.solve(
-            J @ np.swapaxes(J, 1, 2) + damping + 1e-14 * np.eye(6), (J @ error[..., None])
-        )[..., 0]
+        square = np.swapaxes(J, 1, 2) @ J + damping + 1e-14 * np.eye(6)
+        step = (J @ np.linalg.solve(square, error[..., None]))[..., 0]
         q[left] += np.clip(step, -0.5, 0.5)
     q = wrap(q)
     q[~found] = np.nan
-    return q.reshape(*T.shape[:-2], _STARTS, 6)
+    return q.reshape(*T.shape[:-2], _STARTS, model.joints)
 
 
 def _pose_error(now: Float64, goal: Float64) -> Float64:

@@ -146,7 +146,9 @@ def _own_model(name: str, table: Any, folder: Path) -> ArmModel:
         rows = np.array(table["dh"], dtype=np.float64) * [1, 1, np.pi / 180, np.pi / 180]
         return dh_model(name, rows, radius=radius, **limits)
     except (AttributeError, KeyError, TypeError, ValueError) as err:
-        hint = "it has urdf, base and tip, or dh = [[a, d, alpha_deg, theta_deg], ...] of six rows, metres"
+        hint = (
+            "it has urdf, base and tip, or dh = [[a, d, alpha_deg, theta_deg], ...] of a row a joint, metres"
+        )
         raise ConfigError(f"[arm.kinematics]: {type(err).__name__}: {err}", hint=hint) from err
 
 

@@ -201,7 +201,7 @@ class ReplayArm(_Replayed, Arm):
     def move_to(self, joints: Float64) -> ArmState:
         """Go to the view recorded there (or the next by number), at once.
 
-        Raises :class:`MotionRefused`: not six finite angles within the arm's limits; :class:`DeviceError`: by
+        Raises :class:`MotionRefused`: not as many finite angles as it has joints, within the arm's limits; :class:`DeviceError`: by
         number, and there is no further view.
         """
         self._latch.check(self._latch.token)

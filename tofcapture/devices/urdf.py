@@ -14,12 +14,12 @@ from tofcapture.poses import Float64, rotation_exp, transform
 
 
 def urdf_model(path: Path, base: str, tip: str, radius: float, **limits: Float64) -> ArmModel:
-    """Read the six turning joints between the links ``base``, the frame of the arm's poses, and ``tip``, its flange.
+    """Read the turning joints, six or more, between the links ``base``, the frame of the arm's poses, and ``tip``, its flange.
 
-    Meshes are not looked at: links are ``radius`` metres thick. ``low`` and ``high`` (6,) rad replace the file's joint limits.
+    Meshes are not looked at: links are ``radius`` metres thick. ``low`` and ``high`` (J,) rad replace the file's joint limits.
 
-    Raises :class:`ConfigError`: not readable, no URDF, no such link, or other than six joints that turn
-    between them; :class:`ValueError`: words where numbers should be.
+    Raises :class:`ConfigError`: not readable, no URDF, no such link, or fewer than six joints between
+    them, or some that do not turn; :class:`ValueError`: words where numbers should be.
     """
     try:
         root = ET.parse(path).getroot()  # noqa: S314  a file of the user's own station
@@ -32,11 +32,11 @@ def urdf_model(path: Path, base: str, tip: str, radius: float, **limits: Float64
         chain.insert(0, above[link])
         link = next((p.get("link") for p in above[link].findall("parent")), None)
     moving = [joint for joint in chain if joint.get("type") != "fixed"]
-    if link != base or len(moving) != 6 or {j.get("type") for j in moving} - {"revolute", "continuous"}:
+    if link != base or len(moving) < 6 or {j.get("type") for j in moving} - {"revolute", "continuous"}:
         names = ", ".join(str(one.get("name")) for one in root.iter("link"))
         found = ", ".join(f"{j.get('name')} ({j.get('type')})" for j in moving) or "none"
         raise ConfigError(
-            f"{path}: expected six turning joints from {base!r} to {tip!r}, got {found}",
+            f"{path}: expected six turning joints or more from {base!r} to {tip!r}, got {found}",
             hint=f"base and tip of [arm.kinematics] are two of its links: {names}",
         )
     fixed, T, ends = [], np.eye(4), []

@@ -158,7 +158,9 @@ def _sizes(file: h5py.File, info: TofInfo, stereo: StereoInfo) -> dict[str, int]
     shape: tuple[int, ...] = raw.shape if isinstance(raw, h5py.Dataset) else ()
     (H, W), (SH, SW) = info.camera.shape, stereo.camera.shape
     N, F = shape[:2] if len(shape) == 5 else (1, *shape[:1], 0)[:2]
-    return {"N": N, "F": F, "K": len(info.modulation_hz), "H": H, "W": W, "SH": SH, "SW": SW}
+    arm = file.get("arm/before/joints")
+    J = max(arm.size, 6) if isinstance(arm, h5py.Dataset) else 6
+    return {"N": N, "F": F, "K": len(info.modulation_hz), "H": H, "W": W, "SH": SH, "SW": SW, "J": J}
 
 
 def _expected(file: h5py.File, field: Field, layout: Layout) -> bool:

@@ -49,7 +49,7 @@ class Field:
         Allowed numpy dtypes.
     dims
         Its shape in words: ``N`` views, ``F`` frames, ``K`` raw channels, ``H W`` the ToF image, ``2H 2W`` twice that,
-        ``SH SW`` the stereo grid, or a number.
+        ``SH SW`` the stereo grid, ``J`` joints of the arm, or a number.
     units
         Stored as the dataset's attribute ``units``; ``1`` is a plain number.
     chunk
@@ -130,7 +130,7 @@ stereo_info | JSON | model, serial, intrinsics of the point map's grid
 provenance  | JSON | versions, digests of inputs, seeds, UTC time
 """
 _ARM = """\
-arm/{0}/joints        | float64 | 6   | - | rad | measured joint angles {0} the exposures; NaN: no arm
+arm/{0}/joints        | float64 | J   | - | rad | measured joint angles {0} the exposures; NaN: no arm
 arm/{0}/T_base_flange | float64 | 4 4 | - | m   | flange to base, {0} the exposures
 arm/{0}/time_ns       | int64   |     | - | ns  | monotonic clock
 """

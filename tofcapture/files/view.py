@@ -188,7 +188,7 @@ def write_view(path: str | Path, view: View) -> str:
 def _write(file: h5py.File, view: View, arrays: dict[str, Array]) -> None:
     F, K, H, W = view.tof.raw.shape
     SH, SW = view.stereo.info.camera.shape
-    sizes = {"F": F, "K": K, "H": H, "W": W, "SH": SH, "SW": SW}
+    sizes = {"F": F, "K": K, "H": H, "W": W, "SH": SH, "SW": SW, "J": len(view.arm_before.joints)}
     values = {
         "scene": view.scene,
         "index": view.index,

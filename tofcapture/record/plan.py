@@ -58,7 +58,7 @@ REMEDIES = {
 }
 """Why a candidate is no view, in words, and what would help."""
 REFUSALS = tuple(REMEDIES)  # the number of a refusal is its place here
-JOINT_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.25])  # in "close to home"
+_WRIST_WEIGHTS = (0.5, 0.5, 0.25)  # of the last three joints in "close to home"; 1 for those that carry them
 _LOG_DISTANCE = 0.6  # rad per e-fold of distance: how much a nearer view counts against a turned one
 _FEW = 24  # candidates that each pick of the sampling chooses among
 _MOST_TURNS = 36
@@ -74,7 +74,7 @@ class PlannedView:
     """One view to take; lengths in metres, angles in radians."""
 
     index: int  # rank in the sampling, not in the order of travel
-    joints: Float64  # (6,) goal
+    joints: Float64  # (J,) goal
     T_base_flange: Float64  # (4, 4) nominal pose there
     distance: float  # from the ToF camera to the target; NaN, as the next, where a person chooses the place
     direction: Float64  # (3,) unit, from the target to the camera, base frame
@@ -173,10 +173,15 @@ def plan_scene(station: Station, scene: str, views: int, turns: int = 1) -> Plan
         raise ConfigError(f"turns: {limit}, got {turns}")
     if station.arm.by_hand:
         return _by_hand(views, turns, fixed=station.arm.fixed)
-    workcell = workcell_of(station.config)
+    workcell, model = workcell_of(station.config), station.arm.kinematics()
+    if len(workcell.home) != model.joints:
+        raise ConfigError(
+            f"[plan] home: expected {model.joints} angles of the {model.name}, got {len(workcell.home)}",
+            hint="home = [...] in radians, from which every view is reached",
+        )
     digest = hashlib.sha256(f"plan|{station.seed}|{scene}".encode()).digest()
     plan = plan_views(
-        station.arm.kinematics(),
+        model,
         station.rig,
         workcell,
         workcell.board if board else workcell.target,
@@ -206,7 +211,7 @@ def _by_hand(views: int, turns: int, *, fixed: bool) -> Plan:
 def prove(station: Station, plan: Plan) -> list[list[Float64]]:
     """Go through a plan in thought, from where the arm stands to home, and check every leg as the arm will.
 
-    Returns the goals (6,) of each view's way, and of the way home after the last one.
+    Returns the goals (J,) of each view's way, and of the way home after the last one.
 
     Raises :class:`MotionRefused`: a leg is refused; the message names its view.
     """
@@ -279,7 +284,7 @@ def plan_views(
 
 
 def _from_home(model: ArmModel, rig: Rig, workcell: Workcell, joints: Float64, check: Check | None) -> bool:
-    """Tell whether the arm goes from home to joints (6,) and back in a straight way."""
+    """Tell whether the arm goes from home to joints (J,) and back in a straight way."""
     if not is_clear(model, rig, workcell, workcell.home, joints, _AIR):
         return False
     try:
@@ -387,7 +392,7 @@ def hold_poses(
 ) -> tuple[Callable[[int], list[tuple[Float64, float]]], NDArray[np.int8], Float64]:
     """Find joints that hold flange poses (C, rolls, 4, 4) and meet nothing, each joint turned as near to home as it can be.
 
-    Returns a function that gives those of one candidate, (6,) with the share of an object that they show: the most first, of
+    Returns a function that gives those of one candidate, (J,) with the share of an object that they show: the most first, of
     alike ones the nearest to home. With it come refusals (C,): indices into :data:`REFUSALS` of what stood in the way, -1 for
     nothing; and the largest shares (C,). Unless ``both`` cameras matter, shares are NaN and refuse nothing.
     """
@@ -395,7 +400,7 @@ def hold_poses(
     q = workcell.home + wrap(inverse_all(model, T_base_flange, workcell.home) - workcell.home)
     # A joint that may not turn that far may still turn the other way round.
     q = np.where(q > model.high, q - 2 * np.pi, np.where(q < model.low, q + 2 * np.pi, q))
-    q = q.reshape(count, rolls, -1, 6)
+    q = q.reshape(count, rolls, -1, model.joints)
     reached: Bools = np.all((q >= model.low) & (q <= model.high), axis=-1)  # NaN is not
     hits = np.zeros((*reached.shape, len(REASONS)), dtype=bool)
     hits[reached] = obstacles(model, rig, workcell, q[reached], _AIR)
@@ -411,13 +416,14 @@ def hold_poses(
         refusal[(refusal < 0) & ~clear.any(axis=(1, 2))] = REFUSALS.index("sight")
     most = np.where(clear, share, 0.0).max(axis=(1, 2))
     behind = np.floor((most[:, None, None] - np.nan_to_num(share)) / _ALIKE) if both else 0.0
-    away = (JOINT_WEIGHTS * np.nan_to_num(q - workcell.home) ** 2).sum(axis=-1)
+    weights = np.append(np.ones(model.joints - 3), _WRIST_WEIGHTS)
+    away = (weights * np.nan_to_num(q - workcell.home) ** 2).sum(axis=-1)
     cost = np.where(clear, away + 1e3 * behind, np.inf).reshape(count, -1)
 
     def holds(candidate: int) -> list[tuple[Float64, float]]:
         order = np.argsort(cost[candidate], kind="stable")[: int(clear[candidate].sum())]
         # Rounded to a millionth, goals are the same on machines whose last bits differ.
-        goals, shown = np.round(q[candidate].reshape(-1, 6), 6), share[candidate].reshape(-1)
+        goals, shown = np.round(q[candidate].reshape(-1, model.joints), 6), share[candidate].reshape(-1)
         return [(goals[n], float(shown[n])) for n in order]
 
     return holds, refusal, most

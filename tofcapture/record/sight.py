@@ -148,7 +148,7 @@ def _pixels(camera: Camera, T_base_camera: Float64, points: Float64) -> tuple[Bo
 
 
 def blocked(model: ArmModel, rig: Rig, workcell: Workcell, joints: Float64) -> Bools:
-    """Tell at which joint angles (N, 6) the arm, or what its base stands on, is between an eye and the target."""
+    """Tell at which joint angles (N, J) the arm, or what its base stands on, is between an eye and the target."""
     body = body_of(model, rig, workcell, joints)
     T_base_flange = forward(model, joints)
     places = T_base_flange[:, None, :3, :3] @ eyes(rig, workcell)[:, :, None]

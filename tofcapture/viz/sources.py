@@ -142,7 +142,7 @@ def near(points: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def links_of(arm: ArmModel | None, joints: Float64) -> Float64 | None:
-    """(7, 3) origins of an arm's links from the base to the flange, metres; ``None`` without a model, or joints."""
+    """(J + 1, 3) origins of an arm's links from the base to the flange, metres; ``None`` without a model, or joints."""
     return (
         None
         if arm is None or np.isnan(joints).any()

@@ -3,58 +3,40 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from tofcapture.devices import Arm
-from tofcapture.devices.clearance import workcell_of
-from tofcapture.devices.faults import ArmFault, NotReady, StopLatch
-from tofcapture.devices.kinematics import check_joints, forward, pose_error
-from tofcapture.devices.ur_rtde.limits import (
-    ARRIVED,
-    check_goal,
-    check_way,
-    duration,
-    follow,
-    joint_speed,
-    read_settings,
-    settle,
-)
-from tofcapture.devices.ur_rtde.link import Link, Sample
+from tofcapture.devices.arm.checked import CheckedArm
+from tofcapture.devices.arm.limits import Sample, duration, follow
+from tofcapture.devices.faults import ArmFault, NotReady
+from tofcapture.devices.kinematics import forward, pose_error
+from tofcapture.devices.ur_rtde.link import Link
 from tofcapture.devices.ur_rtde.probe import Controller, probe
-from tofcapture.errors import ConfigError, MotionRefused
-from tofcapture.frames import ArmInfo, ArmState
+from tofcapture.devices.ur_rtde.settings import read_settings
+from tofcapture.errors import ConfigError
+from tofcapture.frames import ArmInfo
 from tofcapture.poses import Float64, invert, rotation_exp, transform
 
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
-    from tofcapture.rig import Rig
 
-_DECELERATION, _HALT = 2.0, 0.2  # rad/s^2 of a stop on request at least; s that it takes at most
-_PARENT = (2.0, 10.0)  # s of the station's silence that stop a motion, and an idle arm
+_PARENT = 10.0  # s of the station's silence after which an idle arm's watchdog is not fed
 
 
-class UrArm(Arm):
-    """A UR arm behind ``ur_rtde``; ``table`` is that of :class:`limits.Settings`.
+class UrArm(CheckedArm[Link]):
+    """A UR arm behind ``ur_rtde``; ``table`` is that of :class:`settings.Settings`.
 
     The station's ``context`` says whether motion is allowed, and where things stand.
     """
 
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
         self._settings = read_settings(table)
-        self._context = context
-        self._link: Link | None = None
+        super().__init__(self._settings, context)
         self._controller: Controller | None = None
-        self._rig: Rig | None = None
         self._T_flange_tcp: Float64 = np.eye(4)
-        self._latch, self._moving, self._closed = StopLatch(), False, threading.Event()
-        self._goal: Float64 | None = None  # where it was sent last
-        self._silence = 0.0
-        self._fault: ArmFault | None = None
 
     def describe(self) -> ArmInfo:
         """Name the model, and the serial number or the address of the station file."""
@@ -71,9 +53,8 @@ class UrArm(Arm):
         Raises :class:`ArmFault`: the named state in which the controller is; :class:`ConfigError`: the arm's
         pose is not that of the model, or the library is missing.
         """
-        self._latch, self._goal = StopLatch(), None
         self._controller = probe(self._settings)
-        self._closed.clear()
+        self.opening()
         self._link = Link(self._settings.host, scaling=self._controller.scaling)
         try:
             self._prepare(self._link)
@@ -89,7 +70,7 @@ class UrArm(Arm):
         self._T_flange_tcp = self._tcp()
         sample = link.fresh()
         self._check_model(sample)
-        if not self._within(sample.joints):
+        if not self.within(sample.joints):
             raise NotReady(
                 "the controller says that its safety limits do not allow the pose in which the arm stands",
                 hint="move it within its limits on the pendant. A controller that denies every pose cannot be asked: "
@@ -107,12 +88,8 @@ class UrArm(Arm):
         """
         self._closed.set()
         if self._link is not None and self._link.playing and self._link.trouble() is None:
-            self._link.command("stopJ", 2.0, self._deceleration)
+            self._link.command("stopJ", 2.0, self._settings.deceleration)
             self._link.command("stopScript", 2.0)
-
-    def equip(self, rig: Rig) -> None:
-        """Say what the arm carries; without it nothing moves."""
-        self._rig = rig
 
     def cautions(self) -> list[str]:
         """Say which checks the station file leaves out."""
@@ -125,83 +102,17 @@ class UrArm(Arm):
             out.append(f'[arm] pose = "joints": nobody checks that this arm is a {self._settings.model.name}')
         return out
 
-    @property
-    def _deceleration(self) -> float:
-        return max(_DECELERATION, self._settings.speed / _HALT)
-
-    def state(self) -> ArmState:
-        """Measure the joints now, newer than this call."""
-        return self._state(self._opened().fresh())
-
-    def move_to(self, joints: Float64) -> ArmState:
-        """Check the way, move, wait until settled.
-
-        Raises :class:`MotionRefused`: motion is not allowed, the goal or the way is refused, or somebody said
-        stop (MotionStopped); :class:`NotSettled`: the arm does not come to rest; :class:`ArmFault`: the named
-        state in which the arm is now.
-        """
-        token, link = self._latch.token, self._opened()
-        start = link.fresh()
-        goal = self._checked(start, joints)
-        self._moving = True
-        try:
-            self._goal = goal
-            if np.abs(goal - start.joints).max() > ARRIVED:
-                self._go(link, start, goal, token)
-            return self._state(settle(link, self._settings.settle, lambda: self._latch.check(token)))
-        except BaseException:
-            self._halt(link)
-            raise
-        finally:
-            self._moving = False
-
-    def check_move(self, start: Float64, goal: Float64) -> None:
-        """Check a motion as ``move_to`` does, the controller's own limits too."""
-        if self._rig is None:
-            raise MotionRefused("the arm does not know what it carries", hint="open it as part of a station")
-        goal = check_goal(self._settings, start, goal)
-        check_way(self._settings, self._rig, workcell_of(self._context.config), start, goal)
-        if not self._within(goal):
-            raise MotionRefused("move: the controller's safety limits refuse the goal")
-
     def stop(self) -> None:
         """Stop now, and stay so; an arm whose script has ended has stopped already."""
-        self._latch.stop()
+        super().stop()
         link = self._link
         if link is not None and not self._closed.is_set() and link.playing:
-            link.command("stopJ", 4.0, self._deceleration)
-
-    def interrupt(self) -> None:
-        """Make a running ``move_to`` stop; from another thread."""
-        self._latch.stop()
-
-    def resume(self) -> None:
-        """Move again when asked."""
-        self._latch.resume(self._latch.token)
-
-    def watch(self, silence: float) -> None:
-        """Look after link, safety and script; stop a motion when the station has fallen silent. See :class:`Device`."""
-        self._silence = silence
-        link = self._link
-        if link is None or self._closed.is_set():
-            return
-        if self._moving and silence > _PARENT[0]:
-            self._latch.stop()
-        fault = self._fault or link.overdue()
-        if fault is None and not self._moving:  # a move reports its own faults, after stopping
-            fault = link.trouble()
-        if fault is not None and not self._closed.is_set():
-            raise fault
-
-    def _opened(self) -> Link:
-        if self._link is None or self._closed.is_set():
-            raise NotReady("the arm is not open", hint="use the station as a context manager")
-        return self._link
+            link.command("stopJ", 4.0, self._settings.deceleration)
 
     def _keep_alive(self) -> None:
         """Feed the watchdog between calls, as long as the station lives."""
         while not self._closed.wait(0.1):
-            if self._silence > _PARENT[1] or self._moving or self._link is None:
+            if self._silence > _PARENT or self._moving or self._link is None:
                 continue
             try:
                 self._link.kick()
@@ -221,21 +132,20 @@ class UrArm(Arm):
         """Refuse an arm that is not the model of the station file: every check of the way would be wrong."""
         if self._settings.pose == "joints":
             return
-        if wrong := pose_error(self._settings.model, sample.joints, self._flange(sample)):
+        if wrong := pose_error(self._settings.model, sample.joints, self.flange(sample)):
             raise ConfigError(
                 f"[arm] model {self._settings.model.name}: {wrong}",
                 hint='correct [arm] model, or the TCP on the pendant; pose = "joints" does without the controller\'s pose',
             )
 
-    def _flange(self, sample: Sample) -> Float64:
+    def flange(self, sample: Sample) -> Float64:
+        """Find the flange's pose of a sample."""
         if self._settings.pose == "joints":
             return forward(self._settings.model, sample.joints)
         return _matrix(sample.pose) @ invert(self._T_flange_tcp)
 
-    def _state(self, sample: Sample) -> ArmState:
-        return ArmState(sample.joints, self._flange(sample), time.monotonic_ns())
-
-    def _within(self, joints: Float64) -> bool:
+    def within(self, joints: Float64) -> bool:
+        """Ask the controller whether joints are within its safety limits."""
         if self._settings.controller_limits == "ignore":
             return True
         link = self._opened()
@@ -244,34 +154,19 @@ class UrArm(Arm):
             raise fault  # it is not the goal that stands against it
         return within
 
-    def _checked(self, start: Sample, joints: Float64) -> Float64:
-        if not self._context.allow_motion:
-            raise MotionRefused(
-                "motion was not allowed in this run",
-                hint="look at --dry-run, clear the workspace, then add --allow-motion",
-            )
-        goal = check_joints(self._settings.model, joints)
-        # As a dry run checked it: from where the arm was sent, if it stands there.
-        here = start.joints
-        if self._goal is not None and np.abs(self._goal - here).max() < 2 * ARRIVED:
-            here = self._goal
-        self.check_move(here, goal)
-        return goal
-
-    def _go(self, link: Link, start: Sample, goal: Float64, token: object) -> None:
-        settings, workcell = self._settings, workcell_of(self._context.config)
-        assert self._rig is not None
-        speed = joint_speed(settings, self._rig, workcell, start.joints, goal)
-        self._latch.check(token)
-        if not link.command("moveJ", 5.0, goal.tolist(), speed, settings.acceleration, True):
+    def go(self, start: Sample, goal: Float64, speed: float, check: Callable[[], None]) -> None:
+        """Move at a speed; see :class:`CheckedArm`."""
+        link = self._opened()
+        if not link.command("moveJ", 5.0, goal.tolist(), speed, self._settings.acceleration, True):
             raise link.reason("moveJ")
-        seconds = duration(goal - start.joints, speed, settings.acceleration)
-        follow(link, goal, seconds, lambda: self._latch.check(token))
+        seconds = duration(goal - start.joints, speed, self._settings.acceleration)
+        follow(link, goal, seconds, check)
 
-    def _halt(self, link: Link) -> None:
+    def halt(self) -> None:
         """Stop the arm if it can be told; one that cannot has its watchdog."""
-        if link.playing and link.seeing:
-            link.command("stopJ", 4.0, self._deceleration)
+        link = self._link
+        if link is not None and link.playing and link.seeing:
+            link.command("stopJ", 4.0, self._settings.deceleration)
 
 
 def _matrix(pose: Float64) -> Float64:

@@ -17,14 +17,13 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from tofcapture.devices import faults
+from tofcapture.devices.arm.limits import Sample
 from tofcapture.errors import ConfigError, DeviceError
-from tofcapture.poses import Float64
 
 VERSION, CONTROLLER, TEXT = ord("V"), ord("v"), ord("M")
 OUTPUTS, INPUTS, START, PAUSE, DATA = ord("O"), ord("I"), ord("S"), ord("P"), ord("U")
@@ -134,17 +133,6 @@ _REASON = 0.5  # s to wait for the cause of a refused command to show
 _VARIABLES = (
     "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "robot_mode", "safety_status_bits", "runtime_state",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One reading."""
-
-    timestamp: float  # controller's clock, s
-    joints: Float64  # (6,) measured, rad
-    speeds: Float64  # (6,) measured, rad/s
-    pose: Float64  # (6,) of the active TCP, m and rad
-    scaling: float  # speed slider, 0 to 1
 
 
 class Link:

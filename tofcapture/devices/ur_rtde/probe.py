@@ -17,7 +17,7 @@ from typing import Self, TextIO
 
 from tofcapture.devices.faults import ControllerSilent, NotReady, StaleData
 from tofcapture.devices.ur_rtde import link as wire
-from tofcapture.devices.ur_rtde.limits import Settings
+from tofcapture.devices.ur_rtde.settings import Settings
 
 DASHBOARD = 29999
 _TIMEOUT = 2.0  # s for each answer
