@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 
 from tests import PATIENCE
+from tests.still_station import recorded
+from tests.test_arducam_driver import SMALL, frames, table, wall
 from tofcapture.devices import registry
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.stereo import realsense
 from tofcapture.devices.stereo.realsense import RealSense
+from tofcapture.devices.tof.arducam import ArducamTof
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.testing import check_stereo
 
 rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed")
 SOON = 15.0 + PATIENCE
-W, H, UNIT = 64, 48, 0.0001
+W, H, UNIT = 320, 240, 0.0001
 
 
 class Emulated:
@@ -29,7 +32,7 @@ class Emulated:
         self.device.register_info(rs.camera_info.serial_number, serial)
         self.sensor = self.device.add_sensor("Stereo Module")
         lens = rs.intrinsics()
-        lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy = W, H, 50.0, 51.0, 31.5, 23.5
+        lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy = W, H, 250.0, 255.0, 159.5, 119.5
         lens.model, lens.coeffs = rs.distortion.brown_conrady, [0.0] * 5
         video = rs.video_stream()
         video.type, video.index, video.uid, video.width, video.height = rs.stream.depth, 0, 1, W, H
@@ -93,7 +96,7 @@ def test_points_scale_and_missing(camera, tmp_path):
     assert np.isnan(frame.points[0]).all()
     np.testing.assert_allclose(frame.points[1:, :, 2], 1.5, atol=1e-6)
     np.testing.assert_allclose(
-        frame.points[10, 20], [1.5 * (20 - 31.5) / 50, 1.5 * (10 - 23.5) / 51, 1.5], atol=1e-6
+        frame.points[10, 20], [1.5 * (20 - 159.5) / 250, 1.5 * (10 - 119.5) / 255, 1.5], atol=1e-6
     )
     assert driver(tmp_path).describe().model == "RealSense D435"  # without opening, from the file
     assert registry.load_driver("realsense").keys() == {"stereo"}
@@ -106,6 +109,36 @@ def test_the_contract_holds(camera, tmp_path):
     check_stereo(lambda: driver(tmp_path))
 
 
+def test_a_recording_is_made_and_checks(camera, monkeypatch, tmp_path):
+    """From the library's software device to a recording that ``check`` passes."""
+    with driver(tmp_path):
+        pass
+    (tmp_path / "frames.raw").write_bytes(frames("b0410", wall("b0410", 1.5), 4))
+    stereo, tof = {"serial": "8196", "size": [W, H], "fps": 30}, table("b0410", tmp_path / "frames.raw")
+    view = recorded(monkeypatch, tmp_path, SMALL, tof, stereo, stereo=RealSense, tof=ArducamTof)
+    assert view.stereo.info.camera.fx == 250.0
+    np.testing.assert_allclose(np.nanmedian(view.stereo.points[..., 2]), 1.5, atol=1e-4)
+
+
+def test_a_bag_is_played(camera, monkeypatch, tmp_path):
+    """What the library recorded to a bag comes out of it again."""
+    bag = tmp_path / "wall.db3"
+    camera.sensor.set_option(rs.option.emitter_enabled, 1.0)
+    recorder = rs.recorder(str(bag), camera.device)
+    sensor, queue = recorder.query_sensors()[0], rs.frame_queue(9)
+    sensor.open(sensor.get_stream_profiles()[0])
+    sensor.start(queue)
+    for _ in range(30):
+        queue.wait_for_frame(5000)
+    sensor.stop()
+    sensor.close()
+    del recorder, sensor
+    monkeypatch.undo()  # the library's own context
+    with driver(tmp_path, bag="wall.db3", settle=1) as stereo:
+        frame = stereo.capture()
+    np.testing.assert_allclose(np.nanmedian(frame.points[..., 2]), 1.5, atol=1e-4)
+
+
 def test_faults_have_names_in_time(camera, tmp_path):
     """Absent, another mode, silent, unplugged between frames, calibrated anew: each a named error within 15 s."""
     begun = time.monotonic()
@@ -114,7 +147,7 @@ def test_faults_have_names_in_time(camera, tmp_path):
         driver(tmp_path, serial="77"),
     ):
         pass
-    with pytest.raises(DeviceError, match="64 x 48 at 30"), driver(tmp_path, size=[848, 480]):
+    with pytest.raises(DeviceError, match="320 x 240 at 30"), driver(tmp_path, size=[848, 480]):
         pass
     with driver(tmp_path) as stereo:
         stereo.capture()
@@ -124,7 +157,7 @@ def test_faults_have_names_in_time(camera, tmp_path):
         camera.silent = False
         assert np.isfinite(stereo.capture().points).any()
     file = tmp_path / "realsense-8196.toml"
-    file.write_text(file.read_text().replace("fx = 50.0", "fx = 55.0"))
+    file.write_text(file.read_text().replace("fx = 250.0", "fx = 255.0"))
     with pytest.raises(DeviceError, match="calibration is not the one"), driver(tmp_path):
         pass
     with pytest.raises(DeviceError, match="no bag"), driver(tmp_path, bag="none.bag"):

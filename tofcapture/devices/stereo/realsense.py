@@ -111,8 +111,12 @@ class RealSense(ReopenedCamera, StereoDevice):
                 self._emitter(0.0)
 
     def _emitter(self, value: float) -> None:
-        if self._sensor.supports(self._rs.option.emitter_enabled):
-            self._sensor.set_option(self._rs.option.emitter_enabled, value)
+        self._set(self._rs.option.emitter_enabled, value)
+
+    def _set(self, option: Any, value: float) -> None:
+        """Set an option that the sensor has; a recording's stay what they were."""
+        if self._sensor.supports(option) and not self._sensor.is_option_read_only(option):
+            self._sensor.set_option(option, value)
 
     def connect(self, stack: ExitStack) -> None:
         """Find the camera, choose its mode, start depth, and see that its calibration is the known one."""
@@ -147,10 +151,9 @@ class RealSense(ReopenedCamera, StereoDevice):
     def _expose(self, rs: Any) -> None:
         """Set the exposure, or let the camera find it."""
         exposure = self._table.get("exposure")
-        if self._sensor.supports(rs.option.enable_auto_exposure):
-            self._sensor.set_option(rs.option.enable_auto_exposure, float(exposure is None))
+        self._set(rs.option.enable_auto_exposure, float(exposure is None))
         if exposure is not None:
-            self._sensor.set_option(rs.option.exposure, float(exposure) * 1e6)
+            self._set(rs.option.exposure, float(exposure) * 1e6)
 
 
 def _points(depth: NDArray[np.float64], camera: Camera) -> NDArray[np.float32]:
