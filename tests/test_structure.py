@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import tomllib
 from collections import Counter
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -59,3 +60,11 @@ def test_names_in_the_docs_exist(page):
     wrong = [name for name in NAME.findall(text) if name not in GROUPS and not _there(name)]
     wrong += [path for path in FILE.findall(text) if not (ROOT / path).exists()]
     assert wrong == []
+
+
+def test_the_picture_of_the_rooms_names_each():
+    """docs/pictures/rooms.svg has every layer that lint-imports holds."""
+    drawn = (ROOT / "docs/pictures/rooms.svg").read_text()
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    rooms = {room for c in contracts for layer in c.get("layers", ()) for room in layer.split(" | ")}
+    assert [room for room in sorted(rooms - {"__main__"}) if f">{room}</text>" not in drawn] == []
