@@ -213,7 +213,7 @@ def spread(groups: Mapping[str, Mapping[str, Row]]) -> dict[str, dict[str, dict[
 def told(results: Mapping[str, Any]) -> list[str]:
     """Say for people what :meth:`Objects.table` holds: shares, and what of the sensor's errors is left; crop: all above the table."""
     kinds = results["classes"]
-    whole = next(iter(kinds.get("crop", {}).values()), {}).get("pixels", 0)
+    whole = next((row["pixels"] for row in kinds.get("crop", {}).values()), 0.0)
     lines = [
         "",
         f"{'pixels':24} {'share':>6} {'MAE mm':>8} {'model':>7} {'MAE':>6} {'RMSE':>6} {'normals':>8} {'1 sigma':>8}",
