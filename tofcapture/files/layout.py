@@ -141,7 +141,7 @@ gt/mask_{0}x{1}    | uint8   | N {2}H {2}W   | 1 * *   | 1 | mask bits, see belo
 """
 _FUSED = """\
 fused/sigma_{0}x? | float32 | N {1}H {1}W | 1 * * | m | standard deviation of that depth; NaN: not known
-fused/views_{0}x? | int8 | N {1}H {1}W | 1 * * | 1 | views that it is made of; negative: not the own one; 0: none
+fused/views_{0}x? | int8 | N {1}H {1}W | 1 * * | 1 | views it is made of; negative: without its own; 0: none
 """
 # One coordinate of the point map per chunk: x, y and z each pack better alone, and depth is read without the others.
 VIEW = _layout(
