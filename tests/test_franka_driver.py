@@ -112,7 +112,7 @@ def test_moves_straight_and_refuses(sim, tmp_path):
         assert np.abs(seen - HOME - along[:, None] * (THERE - HOME)).max() < np.radians(1.0)
         too_far, table = THERE.copy(), HOME.copy()
         too_far[6] += 3.0
-        table[[1, 3]] += 1.2, 1.0
+        table[[1, 3]] = 1.5, -0.9
         for bad in (THERE * np.nan, THERE[:6], too_far, table):
             with pytest.raises(MotionRefused):
                 arm.move_to(bad)
