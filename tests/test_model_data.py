@@ -85,10 +85,20 @@ def test_mirroring_twice_is_the_identity_and_keeps_the_geometry(dataset, axis):
 
 def test_processes_share_an_epoch_without_overlap():
     """Two ranks take different samples and equally many batches."""
-    one, two = (epoch_batches(21, 4, 0, 1, rank, 2) for rank in (0, 1))
+    one, two = (epoch_batches([0] * 21, 4, 0, 1, rank, 2) for rank in (0, 1))
     assert len(one) == len(two) == 2
     assert not {k for b in one for k in b} & {k for b in two for k in b}
-    assert len(epoch_batches(3, 4, 0, 0)) == 1
+    assert len(epoch_batches([0] * 3, 4, 0, 0)) == 1
+
+
+def test_a_batch_is_of_one_kind_and_none_is_forgotten():
+    """Cameras of other channels or sizes never meet in a batch; every one of them is seen, and in another order each epoch."""
+    kinds = [f"{i % 3}" for i in range(30)] + ["rare"]
+    batches = [epoch_batches(kinds, 4, 0, epoch) for epoch in (0, 1)]
+    assert all(len({kinds[i] for _, i in batch}) == 1 for batch in batches[0])
+    assert {kinds[i] for batch in batches[0] for _, i in batch} == set(kinds)
+    assert all(len(batch) == 4 for batch in batches[0])
+    assert [kinds[b[0][1]] for b in batches[0]] != [kinds[b[0][1]] for b in batches[1]]
 
 
 def test_an_empty_split_is_an_error(dataset):
@@ -163,14 +173,15 @@ def test_several_datasets_are_one(dataset, other):
     assert torch.equal(both[(0, 0)][0].raw, one[(0, 0)][0].raw)
 
 
-def test_datasets_that_do_not_go_together_are_refused(dataset, tmp_path):
-    """Whole frames of two sizes make no batch; crops do. One cache holds one dataset."""
+def test_frames_of_two_sizes_share_no_batch_but_crops_do(dataset, tmp_path):
+    """Each size has its batches; a crop that fits into both makes them one kind. One cache holds one dataset."""
     smaller = make_dataset(tmp_path / "smaller", views=1, scale=4, splits=("train",))
-    with pytest.raises(DataError, match=r"8 x 90 x 120.*8 x 45 x 60"):
-        FrameDataset([dataset, smaller], "train")
-    FrameDataset([dataset, smaller], "train", (32, 32))
-    with pytest.raises(DataError, match=r"8 x 45 x 60"):
-        FrameDataset([dataset, smaller], "train", (64, 64))
+    for size, kinds in (((), 2), ((32, 32), 1), ((64, 64), 2)):
+        data = FrameDataset([dataset, smaller], "train", size)
+        assert len(set(data.kinds)) == kinds
+        for batch in epoch_batches(data.kinds, 3, 0, 0):
+            frames, _ = collate([data[key] for key in batch])
+            assert len(frames.depth) == 3
     with pytest.raises(ConfigError, match="one dataset with the cache"):
         FrameDataset([dataset, smaller], "train", (32, 32), cache=tmp_path)
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -15,6 +16,8 @@ from tests.test_model_multipath import HZ, SHAPE, K, corner
 from tests.test_model_networks import TINY_COMPACT, frame
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.evaluation.metrics import angles_deg
+from tofcapture_model.data import with_cues
+from tofcapture_model.frame import Frame
 from tofcapture_model.geometry import multipath
 from tofcapture_model.geometry.maps import (
     doubled_parts,
@@ -26,6 +29,7 @@ from tofcapture_model.geometry.maps import (
 )
 from tofcapture_model.geometry.multipath import STEP, cues, exchange_error, halo_error, surface
 from tofcapture_model.networks.heads import (
+    CORRECTIONS,
     CUE_SCALE,
     FIT_RADII,
     CompactInputs,
@@ -34,7 +38,7 @@ from tofcapture_model.networks.heads import (
     zeroed_conv,
 )
 
-RATIO, CUES, SMOOTH = 6, slice(9, 13), 16
+RATIO, CUES, SMOOTH = 2, slice(8, 13), 16
 """Channels: log ratio of the amplitudes, cues, first smoothed depth."""
 
 
@@ -58,31 +62,34 @@ def test_the_ratio_of_amplitudes_is_that_of_the_high_to_the_low_frequency():
     found = CompactInputs((2,))(data).image[:, RATIO : RATIO + 1]
     bright = (low > 0.05) & (high > 0.05)  # far above the floor of an amplitude
     assert bright.sum() > 1000
-    torch.testing.assert_close(found[bright], (high / low).log()[bright], atol=5e-3, rtol=0)
+    usual = (data.light[:, 0] / data.light[:, 1]).log()  # how much brighter the low one is everywhere
+    torch.testing.assert_close(found[bright], (high / low).log()[bright] + usual, atol=5e-3, rtol=0)
 
 
 def test_candidates_are_the_smoothed_depths_and_the_depth_without_each_cue_s_error():
     """Channels say how far off they are: a smoothed depth minus the decoded one in 2 cm, a cue in centimetres of its usual share."""
     data, windows = frame(batch=1), (1, 2)
     found = CompactInputs(windows)(data)
-    smooth, corrected = found.candidates.split([len(windows), len(CUE_SCALE)], dim=1)
+    smooth, corrected = found.candidates.split([len(windows), CORRECTIONS], dim=1)
     for k, window in enumerate(windows):
         inverse = side_window_planes(data.depth, data.valid + 1e-3, window)[0][:, :1]
         torch.testing.assert_close(smooth[:, k : k + 1], 1 / inverse)
     apart = (smooth - data.depth) / 0.02
     torch.testing.assert_close(found.image[:, SMOOTH : SMOOTH + len(windows)], apart.clamp(-2, 2))
     expected = data.cues * torch.tensor(CUE_SCALE).reshape(1, -1, 1, 1)
-    torch.testing.assert_close(data.depth - corrected, expected, atol=1e-6, rtol=1e-4)
+    torch.testing.assert_close(data.depth - corrected, expected[:, :CORRECTIONS], atol=1e-6, rtol=1e-4)
     torch.testing.assert_close(found.image[:, CUES], (100 * expected).clamp(-2, 2))
 
 
-@pytest.mark.parametrize("gate", range(len(TINY_COMPACT.windows) + len(CUE_SCALE)))
+@pytest.mark.parametrize("gate", range(len(TINY_COMPACT.windows) + CORRECTIONS))
 def test_a_gate_of_one_goes_to_its_candidate(gate):
     """All the way, there and no further."""
     data = frame(batch=1)
     features = CompactInputs(TINY_COMPACT.windows)(data)
-    candidates = len(TINY_COMPACT.windows) + len(CUE_SCALE)
-    head = Raw2Depth(zeroed_conv(3, candidates + 37), TINY_COMPACT, candidates=candidates)
+    features = features._replace(reach=torch.full_like(data.depth, 1e3))
+    candidates = len(TINY_COMPACT.windows) + CORRECTIONS
+    network = replace(TINY_COMPACT, max_residual=0.0)
+    head = Raw2Depth(zeroed_conv(3, candidates + 37), network, candidates=candidates)
     with torch.no_grad():
         head.net.bias[gate] = 1.0
     found = head(torch.zeros(1, 3, 36, 44), features, data)
@@ -156,7 +163,7 @@ def test_cues_come_in_their_order():
     valid, nothing = torch.ones_like(depth), torch.zeros_like(depth)
     high = amplitude * torch.cat([(30 * depth).cos(), (30 * depth).sin()], dim=1)
     low = torch.cat([amplitude, nothing], dim=1)
-    found = cues(torch.cat([low, high], dim=1), depth, valid, nothing + 0.02, K, HZ)
+    found = cues(torch.cat([low, high], dim=1), depth, valid, nothing + 0.02, K, (HZ / 5, HZ))
     maps = surface(depth, valid, amplitude, K)
     expected = [
         exchange_error(maps, K, HZ),
@@ -164,8 +171,9 @@ def test_cues_come_in_their_order():
         halo_error(high, HZ),
         nothing + 0.02,
     ]
+    expected.append(exchange_error(maps, K, HZ / 5, step=2 * STEP, margin=3) - expected[1])
     torch.testing.assert_close(found, torch.cat(expected, dim=1))
-    assert all((found[:, i] - found[:, j]).abs().max() > 1e-3 for i in range(4) for j in range(i))
+    assert all((found[:, i] - found[:, j]).abs().max() > 1e-3 for i in range(5) for j in range(i))
 
 
 def test_the_halo_s_error_is_that_of_a_little_of_all_light_added():
@@ -184,8 +192,8 @@ def test_holes_do_not_count_in_the_mean_gap():
     valid = torch.ones(1, 1, *SHAPE)
     valid[..., ::3] = 0
     gap = torch.where(valid > 0, 0.02, 0.3)
-    found = cues(torch.full((1, 4, *SHAPE), 0.1), torch.full_like(valid, 0.8), valid, gap, K, HZ)
-    torch.testing.assert_close(found[:, 3:], torch.full_like(valid, 0.02))
+    found = cues(torch.full((1, 4, *SHAPE), 0.1), torch.full_like(valid, 0.8), valid, gap, K, (HZ / 5, HZ))
+    torch.testing.assert_close(found[:, 3:4], torch.full_like(valid, 0.02))
 
 
 def test_patches_lie_where_their_pixels_are():
@@ -214,3 +222,27 @@ def test_the_bounces_that_are_left_out_add_little(monkeypatch):
     monkeypatch.setattr(multipath, "BOUNCES", 12)
     every = exchange_error(maps, K, HZ)
     assert (every - some).abs().max() < 0.01 * every.abs().max()
+
+
+def test_what_a_network_reads_knows_neither_lamp_nor_gain_nor_contrast():
+    """A camera of a quarter of the light, or of a tenth less contrast at its high frequency, gives the very same picture."""
+    depth, amplitude = corner(90)
+    low, high = (
+        size * amplitude * torch.cat([(k * depth).cos(), (k * depth).sin()], dim=1)
+        for size, k in ((1.4, 6), (1, 30))
+    )
+    valid, nothing = torch.ones_like(depth), torch.zeros_like(depth)
+
+    def seen(*gains):
+        phasor = torch.cat([low * gains[0], high * gains[1]], dim=1)
+        pixels = valid.shape[-2:]
+        frame = Frame(
+            torch.zeros(1, 8, *pixels), phasor, depth, valid, nothing, nothing + 0.01, nothing,
+            torch.tensor([[20e6, 100e6]]), K.float(), torch.zeros(1, 4, 8), torch.zeros(1, 2), torch.zeros(1, 5),
+        )  # fmt: skip
+        frame = with_cues(Frame(*(x.float() for x in frame)), (20e6, 100e6))
+        return CompactInputs((2, 4))(frame).image
+
+    for gains in ((0.25, 0.25), (1.0, 0.9)):
+        torch.testing.assert_close(seen(*gains), seen(1.0, 1.0), atol=2e-3, rtol=0)
+    assert (seen(1.0, 1.0)[..., :40, :] - seen(1.0, 1.0)[..., 40:80, :]).abs().max() > 0.1

@@ -87,12 +87,12 @@ def test_the_halo_of_a_bright_foreground_draws_a_dark_background_nearer():
     assert halo_error(even, HZ).abs().max() < 1e-6
 
 
-def test_cues_are_four_finite_maps_even_of_noise():
+def test_cues_are_five_finite_maps_even_of_noise():
     """Whatever a frame holds, the maps are finite."""
     g = torch.Generator().manual_seed(0)
     depth = 0.1 + 3 * torch.rand(1, 1, *SHAPE, generator=g)
     valid = (torch.rand(1, 1, *SHAPE, generator=g) > 0.5).float()
     noise = torch.randn(1, 4, *SHAPE, generator=g) * 1e-3
-    found = cues(noise, depth, valid, 10 * torch.randn(1, 1, *SHAPE, generator=g), K, HZ)
-    assert found.shape == (1, 4, *SHAPE)
+    found = cues(noise, depth, valid, 10 * torch.randn(1, 1, *SHAPE, generator=g), K, (2e7, HZ))
+    assert found.shape == (1, 5, *SHAPE)
     assert torch.isfinite(found).all()

@@ -69,10 +69,12 @@ def frame(h=36, w=44, batch=2, seed=0):
         valid=torch.ones_like(depth),
         confidence=torch.rand(batch, 1, h, w, generator=g),
         gap=0.05 * torch.randn(batch, 1, h, w, generator=g),
-        cues=0.01 * torch.randn(batch, 4, h, w, generator=g),
+        cues=0.01 * torch.randn(batch, 5, h, w, generator=g),
         modulation=torch.tensor([[20e6, 100e6]]).expand(batch, 2),
         intrinsics=k,
         demodulation=four_phases().expand(batch, 4, 8),
+        light=torch.tensor([[0.055, 0.04]]).expand(batch, 2),
+        noise=torch.zeros(batch, 5),
     )
 
 
@@ -140,13 +142,17 @@ def test_every_stage_trains_its_parts_and_no_others(network, stage):
 
 
 def test_the_residual_is_bounded_where_asked():
-    """compact cannot move a depth beyond its candidates by more than max_residual."""
+    """compact cannot move a depth by more than max_residual, nor by more than noise and expected multipath allow."""
     model = joint(replace(TINY_COMPACT, max_residual=0.02, refine_iterations=0))
     with torch.no_grad():
         model.raw2depth.net.bias[model.raw2depth.candidates] = 1e6
     data = frame()
     data = data._replace(depth=torch.full_like(data.depth, 0.8), cues=torch.zeros_like(data.cues))
+    torch.testing.assert_close(model(data).depth, torch.full((2, 1, 72, 88), 0.806))  # nothing says it is wrong
+    data.cues[:, 0] = 0.01
     torch.testing.assert_close(model(data).depth, torch.full((2, 1, 72, 88), 0.82))
+    data.valid[:] = 0  # what was not measured may be anywhere
+    assert (model(data).depth > 1.2).all()
 
 
 def test_the_paper_s_networks_read_the_inputs_of_the_ablation():

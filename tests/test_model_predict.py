@@ -353,7 +353,7 @@ def test_a_prediction_neither_copies_from_the_host_nor_looks_at_a_value(monkeypa
         decoder = TorchDecoder(info, NOMINAL_CAMERA, there)
         taps = decoder.taps(np.zeros((8, 180, 240), np.uint16), 40.0)
         with Hosts() as hosts:
-            found = model(with_cues(decoder(taps), 100e6))
+            found = model(with_cues(decoder(taps), (20e6, 100e6)))
     assert found.depth.shape == (1, 1, 360, 480)
     assert hosts.operations > 500
     assert hosts.seen == []

@@ -13,7 +13,6 @@ torch = pytest.importorskip("torch")
 from tests.analytic import make_dataset
 from tests.test_model_baselines import target
 from tests.test_model_networks import frame
-from tofcapture.ops.phase import TapNoise
 from tofcapture_model.config import preset
 from tofcapture_model.data.augment import BurstNoise
 from tofcapture_model.evaluation.evaluate import ONE_SIGMA, calibrate
@@ -38,30 +37,30 @@ def small(rank=0, **training):
     return learner
 
 
-BURST = BurstNoise(4, TapNoise(), 4095.0)
+BURST = torch.tensor([BurstNoise(4, 16.0, 1.25, 4095.0)])
 
 
 def test_what_is_drawn_depends_on_the_step_and_the_process():
     """The same position draws the same, whatever came before; another step, stage or process something else."""
-    data = frame(12, 16, batch=1)
+    data = frame(12, 16, batch=1)._replace(noise=BURST)
     places = [(0, 0, 0), (0, 1, 0), (1, 1, 0), (0, 1, 1), (0, 0, 0)]
     drawn = [
-        small(rank).augmented(data, BURST, Position(stage=stage, step=step)).raw.double().sum().item()
+        small(rank, noise="drawn").augmented(data, Position(stage=stage, step=step)).raw.double().sum().item()
         for stage, step, rank in places
     ]
     assert drawn[0] == drawn[-1]
     assert len(set(drawn)) == len(places) - 1
 
 
-@pytest.mark.parametrize("burst", [None, BURST])
+@pytest.mark.parametrize("noise", ["recorded", "drawn"])
 @pytest.mark.parametrize("phase_error", [0.0, 0.003])
-def test_noise_is_drawn_for_means_of_bursts_and_calibration_where_asked(burst, phase_error):
+def test_noise_is_drawn_for_means_of_bursts_and_calibration_where_asked(noise, phase_error):
     """Fresh noise changes the taps, another calibration depths and the gap's cue; each alone, both, or neither."""
-    data = frame(12, 16, batch=1)
-    found = small(phase_error=phase_error).augmented(data, burst, Position())
-    assert torch.equal(found.raw, data.raw) == (burst is None)
+    data = frame(12, 16, batch=1)._replace(noise=BURST)
+    found = small(phase_error=phase_error, noise=noise).augmented(data, Position())
+    assert torch.equal(found.raw, data.raw) == (noise == "recorded")
     assert torch.equal(found.cues, data.cues) == (phase_error == 0)
-    assert torch.equal(found.depth, data.depth) == (burst is None and phase_error == 0)
+    assert torch.equal(found.depth, data.depth) == (noise == "recorded" and phase_error == 0)
 
 
 def test_a_gradient_is_cut_to_its_norm_and_no_step_goes_further():

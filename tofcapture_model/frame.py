@@ -25,14 +25,18 @@ class Frame(NamedTuple):
     gap: (
         Tensor  #: (B, 1, H, W) range of the lowest minus range of the highest frequency, m: the multipath cue
     )
-    cues: Tensor  #: (B, 4, H, W) depth errors that physics expects, m: geometry.multipath
+    cues: Tensor  #: (B, 5, H, W) depth errors and a gap that physics expects, m: geometry.multipath
     #: (B, F) lowest, highest, then other modulation frequencies, Hz; one frequency is there twice
     modulation: Tensor
     intrinsics: Tensor  #: (B, 4 or 12) of the (H, W) grid, px; see geometry.maps
     demodulation: Tensor  #: (B, 2F, K) weights that turn taps into I and Q of each of these frequencies
+    #: (B, 2) amplitude of the lowest and the highest frequency, in units of the saturation value, by which a white surface would
+    #: answer that faces the sensor at 1 m: estimated over the whole frame. Lamp, gain and contrast are in it, and in nothing else
+    light: Tensor
+    noise: Tensor  #: (B, 5) data.augment.BurstNoise, where noise is drawn anew; else 0
 
 
-NO_MAPS = frozenset({"modulation", "intrinsics", "demodulation"})
+NO_MAPS = frozenset({"modulation", "intrinsics", "demodulation", "light", "noise"})
 """Fields of a frame that have no pixels: neither cropped nor mirrored."""
 
 

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from tofcapture import __version__
-from tofcapture.devices.sim import VERSION
+from tofcapture.devices.sim import VERSION, hashed_generator
+from tofcapture.devices.sim.draw import draw_camera
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.seal import digest_path, sealed_digest, write_text
 from tofcapture.suites import corners, rooms, tabletop
@@ -59,8 +60,8 @@ class DatasetSpec:
     sim: Mapping[str, Any] = field(
         default_factory=dict
     )  #: Overrides of constants, as in a station's ``[sim]``.
-    #: Rigs that the scenes take turns with: each its own brackets, factory calibration and fixed pattern, so
-    #: that a network cannot learn one camera by heart.
+    #: Rigs that the scenes take turns with. One is the station's; several are whole cameras drawn for each, so that a network
+    #: learns cameras and not one of them: :func:`tofcapture.devices.sim.draw.draw_camera`.
     cameras: int = 1
     kinds: tuple[str, ...] = ()  #: Kinds of scenes, in turns, instead of the recipe's pattern (tof100).
 
@@ -83,6 +84,14 @@ class DatasetSpec:
     def rig_seed(self, index: int) -> int:
         """Choose the seed of the rig that takes scene ``index``: the dataset's and a multiple of a large prime."""
         return self.seed + _RIGS_APART * (index % self.cameras)
+
+    def constants(self, index: int) -> dict[str, Any]:
+        """Lay the recipe's, the drawn camera's and the user's constants over each other, for scene ``index``."""
+        drawn: Mapping[str, Any] = {}
+        if self.cameras > 1:
+            rng = hashed_generator(f"camera {self.rig_seed(index)}".encode())
+            drawn = draw_camera(rng, self.sim.get("tof", {}).get("preset"))
+        return layered(self.recipe().sim, drawn, self.sim)
 
     def task(self, index: int) -> str:
         """Digest everything that scene ``index`` depends on."""
@@ -143,7 +152,7 @@ def make_one(spec: DatasetSpec, out: Path, index: int) -> Made:
     work, note, shard = paths(out, scene.name)
     _make_room(work, task)
     provenance = {"suite": spec.suite, "recipe": recipe.version, "index": index, "task": task}
-    job = Job(scene, spec.rig_seed(index), spec.views, spec.frames, layered(recipe.sim, spec.sim), provenance)
+    job = Job(scene, spec.rig_seed(index), spec.views, spec.frames, spec.constants(index), provenance)
     cpu = take_views(job, work / "recording")
     begun = time.process_time()
     config = SampleConfig(**recipe.build)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,13 +34,12 @@ from tofcapture_model.geometry.maps import (
     mirror_intrinsics,
     with_lens,
 )
-from tofcapture_model.geometry.multipath import cues
+from tofcapture_model.geometry.multipath import cues, light, usual_phasor
 
 Float32 = NDArray[np.float32]
 Reader = ShardReader | PackedScene
 MODEST = 1.5e9  # bytes, where the system does not tell what it has
 TABLES = 125  # bytes per pixel of a decoder and its camera's rays, one for each scene
-_MEASURED = 16  # scenes whose first burst the noise is measured on
 
 
 @dataclass(frozen=True)
@@ -97,13 +96,25 @@ def make_frame(
         modulation=modulation(info),
         intrinsics=intrinsics_of(camera),
         demodulation=demodulation(info),
+        light=torch.zeros(2),
+        noise=torch.zeros(5),
     )
-    return frame._replace(cues=with_cues(batched(frame), max(info.modulation_hz)).cues[0])
+    return Frame(*(x[0] for x in with_cues(batched(frame), ends_of(info))))
 
 
-def with_cues(frame: Frame, hz: float) -> Frame:
-    """Add the cues to a batch of decoded frames, on its device; ``hz`` is the highest frequency."""
-    return frame._replace(cues=cues(frame.phasor, frame.depth, frame.valid, frame.gap, frame.intrinsics, hz))
+def ends_of(info: TofInfo) -> tuple[float, float]:
+    """Name the lowest and the highest frequency, Hz."""
+    return min(info.modulation_hz), max(info.modulation_hz)
+
+
+def with_cues(frame: Frame, hz: tuple[float, float]) -> Frame:
+    """Add to a batch of whole decoded frames, on its device, what a crop does not show: light and cues.
+
+    ``hz`` are the lowest and the highest frequency.
+    """
+    frame = frame._replace(light=light(frame.phasor, frame.depth, frame.valid, frame.intrinsics))
+    usual = usual_phasor(frame)
+    return frame._replace(cues=cues(usual, frame.depth, frame.valid, frame.gap, frame.intrinsics, hz))
 
 
 def batched(frame: Frame) -> Frame:
@@ -184,9 +195,7 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
     An item is asked for by ``(epoch, i)``: crop and flip are drawn from ``(seed, epoch, i)``. So an interrupted run goes on with
     the very same samples, whatever the number of workers.
 
-    Raises :class:`DataError`: the split is empty, its frames make no batch, or a cache is not of it;
-    :class:`ConfigError`: a cache with several datasets, or noise to be drawn of cameras that saturate
-    differently.
+    Raises :class:`DataError`: the split is empty, or a cache is not of it; :class:`ConfigError`: a cache with several datasets.
 
     Parameters
     ----------
@@ -201,13 +210,11 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
     frames
         Use only the first so many frames of every view; 0: all.
     mean
-        One item per view, the mean of its frames, for noise that is drawn again as ``burst`` says.
+        One item per view, the mean of its frames, for noise that is drawn again as its ``noise`` says.
     cache_bytes
         Decoded frames and their ground truth are kept in memory up to this size.
     cache
         Folder that ``tofcapture pack`` filled with this split of the one dataset; ``None`` reads the shards.
-    batches
-        Frames are to make batches, and so must be alike; one by one they may be of any cameras.
     """
 
     def __init__(
@@ -222,7 +229,6 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         mean: bool = False,
         cache_bytes: float = 0,
         cache: Path | None = None,
-        batches: bool = True,
     ) -> None:
         folders = [Path(folder)] if isinstance(folder, str | Path) else [Path(each) for each in folder]
         if cache and len(folders) > 1:
@@ -241,8 +247,6 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
                 hint="record more scenes, or choose another --split",
             )
         self.size, self.flip, self.seed, self.mean = tuple(size), flip, seed, mean
-        if batches:
-            _expect_alike(self.readers, self.size)
         least = min(reader.frames for reader in self.readers.values())
         self.averaged = min(least, frames or least) if mean else 1  # frames of an item
         self.samples = [
@@ -251,13 +255,14 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
             for view in range(reader.views)
             for frame in range(1 if mean else min(frames or reader.frames, reader.frames))
         ]
-        self.burst = _burst_noise(self.readers, self.averaged) if mean else None
         cameras = [reader.camera for reader in self.readers.values()]
         self._lens = any(camera.distortion for camera in cameras)
         self._room = cache_bytes - sum(TABLES * camera.width * camera.height for camera in cameras)
         self._frames: dict[SampleId, Frame] = {}
         self._targets: dict[tuple[str, int], Target] = {}
         self._decoders: dict[str, Decoder] = {}
+        self._noises: dict[str, Tensor] = {}
+        self.kinds = [_kind(self.readers[sample.scene], self.size) for sample in self.samples]
 
     def __len__(self) -> int:
         return len(self.samples)
@@ -285,6 +290,8 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         if sample.scene not in self._decoders:
             self._decoders[sample.scene] = frame_decoder(reader.info, reader.camera)
         frame = make_frame(raw, reader.info, reader.camera, temperature, self._decoders[sample.scene])
+        if self.mean:
+            frame = frame._replace(noise=self._noise(reader))
         if self._lens:  # a batch may hold frames of other cameras, without one
             frame = frame._replace(intrinsics=with_lens(frame.intrinsics))
         if self._take_room(frame):
@@ -302,6 +309,20 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
             self._targets[key] = target
         return target
 
+    def _noise(self, reader: Reader) -> Tensor:
+        """Measure the noise of a camera, by its serial number, on its first burst in some scene."""
+        info = reader.info
+        if info.serial not in self._noises:
+            burst = np.stack([reader.raw(0, f) for f in range(self.averaged)])
+            try:
+                noise = photon_transfer([burst], info.saturation) if self.averaged > 1 else TapNoise()
+            except DataError:  # hardly a tap below saturation
+                noise = TapNoise()
+            least = 0.0 if info.offset else -info.saturation
+            row = BurstNoise(self.averaged, noise.electrons_per_unit, noise.read, info.saturation, least)
+            self._noises[info.serial] = torch.tensor(row, dtype=torch.float32)
+        return self._noises[info.serial]
+
     def close(self) -> None:
         """Close the shards."""
         for reader in self.readers.values():
@@ -315,38 +336,11 @@ class FrameDataset(Dataset[tuple[Frame, Target]]):
         return True
 
 
-def _expect_alike(readers: Mapping[str, Reader], size: tuple[int, ...]) -> None:
-    """Refuse frames that make no batch: other numbers of phases, other sizes unless crops of ``size`` fit into all."""
-    kinds: dict[tuple[int, ...], str] = {}
-    for name, reader in readers.items():
-        hz = reader.info.modulation_hz
-        whole = (len(hz), *reader.camera.shape)
-        shape = [min(n, s) for n, s in zip(whole[1:], size or whole[1:], strict=True)]
-        kinds.setdefault(
-            (whole[0], len(set(hz)), *shape),
-            f"{name}, {' x '.join(map(str, whole))} of {len(set(hz))} frequencies",
-        )
-    if len(kinds) > 1:
-        raise DataError(
-            f"expected frames of one kind, got {' and '.join(kinds.values())}",
-            hint="train on them apart, or with a training.crop that fits into all",
-        )
-
-
-def _burst_noise(readers: Mapping[str, Reader], frames: int) -> BurstNoise:
-    """Measure the noise of the frames that a mean of ``frames`` stands for, on bursts of some scenes."""
-    saturations = {reader.info.saturation for reader in readers.values()}
-    if len(saturations) > 1:
-        raise ConfigError(
-            f"training.noise = drawn: expected cameras that saturate alike, got {', '.join(f'{s:g}' for s in sorted(saturations))}",
-            hint='train on them apart, or with training.noise = "recorded"',
-        )
-    some = [readers[name] for name in sorted(readers)][:: -(-len(readers) // _MEASURED)]
-    bursts = (np.stack([reader.raw(0, f) for f in range(frames)]) for reader in some)
-    full_scale = saturations.pop()
-    noise = photon_transfer(bursts, full_scale) if frames > 1 else TapNoise()
-    signed = not all(reader.info.offset for reader in readers.values())
-    return BurstNoise(frames, noise, full_scale, -full_scale if signed else 0.0)
+def _kind(reader: Reader, size: tuple[int, ...]) -> tuple[int, ...]:
+    """Tell frames apart that make no batch: by their channels and frequencies, and the size that crops leave of them."""
+    hz, shape = reader.info.modulation_hz, reader.camera.shape
+    cut = [min(n, s) for n, s in zip(shape, size or shape, strict=True)]
+    return (len(hz), len(set(hz)), *cut)
 
 
 def spare_memory() -> float:
@@ -377,17 +371,20 @@ def collate(items: Sequence[tuple[Frame, Target]]) -> tuple[Frame, Target]:
 
 
 def epoch_batches(
-    count: int, batch: int, seed: int, epoch: int, rank: int = 0, world: int = 1
+    kinds: Sequence[Hashable], batch: int, seed: int, epoch: int, rank: int = 0, world: int = 1
 ) -> list[list[tuple[int, int]]]:
-    """Keys ``(epoch, i)`` of every batch of an epoch, for one of ``world`` processes.
+    """Keys ``(epoch, i)`` of every batch of an epoch, for one of ``world`` processes; a batch holds samples of one of ``kinds``.
 
     The order is a permutation drawn from ``(seed, epoch)``. All processes get equally many full batches, so that they step
-    together; fewer samples than one step needs are repeated.
+    together; fewer samples of a kind than one step needs are repeated.
     """
-    order = np.random.default_rng([seed, epoch]).permutation(count)
-    step = batch * world
-    order = np.resize(order, max(step, count - count % step))
-    return [
-        [(epoch, int(i)) for i in order[s + rank * batch : s + (rank + 1) * batch]]
-        for s in range(0, len(order), step)
-    ]
+    rng, step = np.random.default_rng([seed, epoch]), batch * world
+    order = rng.permutation(len(kinds))
+    steps: list[NDArray[np.int64]] = []
+    for kind in dict.fromkeys(kinds):
+        alike = np.array([i for i in order if kinds[i] == kind])
+        alike = np.resize(alike, max(step, len(alike) - len(alike) % step))
+        steps.extend(np.split(alike, len(alike) // step))
+    if len(set(kinds)) > 1:
+        steps = [steps[k] for k in rng.permutation(len(steps))]
+    return [[(epoch, int(i)) for i in each[rank * batch : (rank + 1) * batch]] for each in steps]

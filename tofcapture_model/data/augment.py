@@ -6,25 +6,26 @@ Each keeps raw taps, phasors, depth and gap consistent: decoding the changed tap
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from tofcapture.ops.phase import TapNoise
 from tofcapture_model.frame import Frame
 from tofcapture_model.geometry.maps import metres_per_radian, rays, turn
 
+_WIDE = 3  # cue that is the gap over a wide window
 _ORDERS = (0, 2, 4)  # of the phase: offset, and the wiggling of sensors with four phases
 
 
 class BurstNoise(NamedTuple):
-    """Hold what it takes to draw the noise of a frame anew."""
+    """Hold what it takes to draw the noise of a frame anew: numbers, or (B, 1, 1, 1) of each of a batch."""
 
-    averaged: float  #: frames that a given one is the mean of
-    noise: TapNoise  #: of one tap of one frame
-    full_scale: float  #: raw value of saturation
-    least: float = 0.0  #: smallest raw value; below 0 where taps are signed
+    averaged: Any  #: frames that a given one is the mean of
+    electrons_per_unit: Any  #: of one tap of one frame, as :class:`tofcapture.ops.phase.TapNoise` has them
+    read: Any
+    full_scale: Any  #: raw value of saturation
+    least: Any = 0.0  #: smallest raw value; below 0 where taps are signed
 
 
 def redraw_noise(taps: Tensor, generator: torch.Generator, burst: BurstNoise) -> Tensor:
@@ -34,19 +35,21 @@ def redraw_noise(taps: Tensor, generator: torch.Generator, burst: BurstNoise) ->
     what was saturated stays so. The generator is of the taps' device.
     """
     taps = taps.to(torch.float32)
-    variance = taps.clamp(min=0) / burst.noise.electrons_per_unit + burst.noise.read**2
+    variance = taps.clamp(min=0) / burst.electrons_per_unit + burst.read**2
     drawn = torch.randn(taps.shape, generator=generator, device=taps.device)
     lacking = (variance - variance / burst.averaged).clamp(min=0).sqrt()
-    out = (taps + drawn * lacking).round().clamp(burst.least, burst.full_scale)
-    return torch.where(taps >= burst.full_scale, burst.full_scale, out)
+    full, least = (torch.as_tensor(x, device=taps.device) for x in (burst.full_scale, burst.least))
+    out = (taps + drawn * lacking).round().clamp(least, full)
+    return torch.where(taps >= full, full, out)
 
 
-def redraw_frame(frame: Frame, generator: torch.Generator, burst: BurstNoise) -> Frame:
+def redraw_frame(frame: Frame, generator: torch.Generator) -> Frame:
     """Draw one more frame of a static burst, decoded: fresh noise on the taps, phasors, depth, confidence and gap.
 
-    ``frame`` (B, ., H, W) is decoded from the mean of ``burst.averaged`` frames. The turn of each phasor moves the range of its
+    ``frame`` (B, ., H, W) is decoded from the mean of some frames, as its ``noise`` says. The turn of each phasor moves the range of its
     frequency, so calibration and wraps stay. Cues stay, too, as they are smooth. Holes keep their filling.
     """
+    burst = BurstNoise(*frame.noise.T.reshape(5, -1, 1, 1, 1))
     raw = redraw_noise(frame.raw * burst.full_scale, generator, burst) / burst.full_scale
     before, after = _phasors(frame, frame.raw), _phasors(frame, raw)
     moves = [
@@ -77,7 +80,8 @@ def redraw_calibration(frame: Frame, generator: torch.Generator, radians: float)
     one = (frame.modulation[:, 0] == frame.modulation[:, 1]).reshape(-1, 1, 1, 1)
     drawn[0] = torch.where(one, drawn[1], drawn[0])  # one frequency has one error
     moved = _moved(frame, drawn)
-    cues = torch.cat([frame.cues[:, :-1], frame.cues[:, -1:] + drawn[0] - drawn[1]], dim=1)
+    wide = frame.cues[:, _WIDE : _WIDE + 1] + drawn[0] - drawn[1]
+    cues = torch.cat([frame.cues[:, :_WIDE], wide, frame.cues[:, _WIDE + 1 :]], dim=1)
     return moved._replace(cues=cues)
 
 

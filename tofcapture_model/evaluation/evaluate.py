@@ -158,7 +158,7 @@ def evaluate(
     expect_writable(Path(out))
     model, config, provenance = load_checkpoint(weights)
     model.to(device)
-    data = FrameDataset(dataset, split, frames=frames, batches=False)
+    data = FrameDataset(dataset, split, frames=frames)
     measured = take_scenes(data, split, scenes)
     sigma = isinstance(model, JointModel) and config.losses.uncertainty == "laplace"
     methods: dict[str, Method] = {"sensor": sensor_estimate, "model": model_method(model, sigma=sigma)}

@@ -281,9 +281,7 @@ def measure_runs(
     """
     target_device = torch.device(device)
     runs = [(name, i, find_model(path)) for name, paths in weights.items() for i, path in enumerate(paths)]
-    data = FrameDataset(
-        dataset, split, frames=frames, cache_bytes=spare_memory(), batches=False
-    )  # every run asks again
+    data = FrameDataset(dataset, split, frames=frames, cache_bytes=spare_memory())  # every run asks again
     measured = take_scenes(data, split, scenes)
     count = len(data.samples)
     _expect_fit([(name, path) for name, _, path in runs], data, target_device)

@@ -146,6 +146,8 @@ class TorchDecoder:
             modulation=self._modulation,
             intrinsics=self._intrinsics,
             demodulation=self._demodulation,
+            light=raw.new_zeros(2),
+            noise=raw.new_zeros(5),
         )
         return Frame(*(x[None] for x in frame))
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture.channels import SPEED_OF_LIGHT
+from tofcapture_model.frame import Frame
 from tofcapture_model.geometry.maps import (
     pixel_slopes,
     plane_normals,
@@ -20,36 +21,84 @@ from tofcapture_model.geometry.maps import (
     thin_intrinsics,
 )
 
-SIGNAL = 0.04  # of saturation: amplitude of a white patch that faces the sensor at 1 m; networks correct it by a factor
+SIGNAL = (
+    0.04  # amplitude of a white surface that faces the sensor at 1 m, to which every camera's light is scaled
+)
 STEP = 10  # pixels per patch
 BOUNCES = 3  # the fourth adds less than the first lacks in knowledge
 _WHITEST = 0.9  # albedo
 _FAR = 3.0  # m
 _GRAZING = 0.15  # cosine below which the direct light of a patch says nothing
-_FAINT = 1e-3  # of saturation; below it an amplitude is noise
+_FAINT = 1e-3  # below it an amplitude is noise
+_TINY = 1e-12
+_PALE, _PALENESS = (
+    0.9,
+    0.6,
+)  # quantile of brightness that is taken for pale, and the albedo that it has on average
 
 
-def cues(phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: Tensor, hz: float) -> Tensor:
-    """Stack four maps of expected depth errors.
+def light(phasor: Tensor, depth: Tensor, valid: Tensor, intrinsics: Tensor) -> Tensor:
+    """Estimate from a frame what its camera's lamp, gain and contrast are: (B, 2), of the lowest and the highest frequency.
 
-    Returns (B, 4, H, W) metres: error by interreflection of what is seen; the same with the scene continued
-    beyond the image; error by the halo if all light were in it; gap averaged over a wide window.
+    It is the amplitude by which a white surface would answer that faces the sensor at 1 m, in the unit of ``phasor``. The brightest
+    tenth of a frame, by the inverse square of its range, is taken for pale; the frequencies are compared by their median. Nobody
+    needs to know the camera, and no network can tell a weaker lamp or less contrast from another one.
+
+    ``phasor`` (B, 4, H, W), ``depth`` and ``valid`` (B, 1, H, W) are those of whole frames.
+    """
+    low, high = (z.square().sum(1)[:, ::3, ::3].flatten(1).sqrt() for z in phasor.chunk(2, dim=1))
+    ray = rays(intrinsics, *depth.shape[-2:]).square().sum(1)
+    square = (ray * depth[:, 0].square())[:, ::3, ::3].flatten(1)
+    seen = (valid[:, 0, ::3, ::3].flatten(1) > 0) & (low > 0) & (high > 0)
+    white = _quantile(high * square, seen, _PALE) / _PALENESS
+    ratio = _quantile((low.clamp_min(_TINY) / high.clamp_min(_TINY)).log(), seen, 0.5).exp()
+    found = torch.stack([white * ratio, white], dim=1)
+    return torch.where(found > 0, found, torch.full_like(found, SIGNAL)).clamp(1e-4, 1e2)
+
+
+def _quantile(values: Tensor, among: Tensor, share: float) -> Tensor:
+    """Find a quantile of some of the values (B, N) of each row, without a look at how many they are; 0 of none."""
+    ordered = torch.where(among, values, torch.full_like(values, torch.inf)).sort(dim=1).values
+    count = among.sum(1, keepdim=True)
+    found = ordered.gather(1, (share * (count - 1).clamp_min(0)).long())
+    return torch.where(count > 0, found, torch.zeros_like(found))[:, 0]
+
+
+def usual_phasor(frame: Frame) -> Tensor:
+    """Scale the phasor (B, 4, H, W) of each frequency to a lamp whose white surface at 1 m answers with :data:`SIGNAL`."""
+    scale = (SIGNAL / frame.light).repeat_interleave(2, dim=1)
+    return frame.phasor * scale[:, :, None, None]
+
+
+def cues(
+    phasor: Tensor, depth: Tensor, valid: Tensor, gap: Tensor, intrinsics: Tensor, hz: tuple[float, float]
+) -> Tensor:
+    """Stack five maps of what physics expects.
+
+    Returns (B, 5, H, W) metres: error by interreflection of what is seen; the same with the scene continued
+    beyond the image; error by the halo if all light were in it; gap averaged over a wide window; gap that the second error makes
+    with that of the lowest frequency.
 
     Parameters
     ----------
     phasor
-        (B, 4, H, W) I and Q of the low, then of the high frequency, units of saturation.
+        (B, 4, H, W) I and Q of the lowest, then of the highest frequency, as of :func:`usual_phasor`.
     depth, valid, gap
         (B, 1, H, W) decoded depth and its weight; range of the low minus range of the high frequency; metres.
     intrinsics, hz
-        (B, 4 or 12), and the high modulation frequency.
+        (B, 4 or 12), and the lowest and the highest modulation frequency.
     """
+    lowest, highest = hz
     high = phasor[:, 2:]
     amplitude = high.square().sum(1, keepdim=True).sqrt()
     maps = surface(depth, valid, amplitude, intrinsics)
-    seen = exchange_error(maps, intrinsics, hz)
-    beyond = exchange_error(maps, intrinsics, hz, step=2 * STEP, margin=3)
-    return torch.cat([seen, beyond, halo_error(high, hz), _broad(gap.clamp(-0.3, 0.3), valid)], dim=1)
+    seen = exchange_error(maps, intrinsics, highest)
+    beyond = exchange_error(maps, intrinsics, highest, step=2 * STEP, margin=3)
+    wide = _broad(gap.clamp(-0.3, 0.3), valid)
+    apart = torch.zeros_like(seen)
+    if lowest < highest:
+        apart = exchange_error(maps, intrinsics, lowest, step=2 * STEP, margin=3) - beyond
+    return torch.cat([seen, beyond, halo_error(high, highest), wide, apart], dim=1)
 
 
 def _broad(image: Tensor, valid: Tensor, shrink: int = 4) -> Tensor:

@@ -62,10 +62,12 @@ def example(batch: int, size: tuple[int, int] = SIZE, seed: int = 0) -> Frame:
         valid=torch.ones(batch, 1, h, w),
         confidence=(0.1 + 0.02 * noise(1)).clamp_min(0.01),
         gap=0.02 * noise(1),
-        cues=0.005 * noise(4),
+        cues=0.005 * noise(5),
         modulation=torch.tensor([[20e6, 100e6]]).repeat(batch, 1),
         intrinsics=camera.repeat(batch, 1),
         demodulation=torch.zeros(batch, 4, 8),
+        light=torch.tensor([[0.055, 0.04]]).repeat(batch, 1),
+        noise=torch.zeros(batch, 5),
     )
 
 

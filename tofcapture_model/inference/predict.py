@@ -26,7 +26,7 @@ from tofcapture.files.view import find_views, view_number
 from tofcapture.frames import TofInfo, View
 from tofcapture.importing.rules import expect_finite
 from tofcapture_model.config import BASELINES
-from tofcapture_model.data import batched, frame_decoder, make_frame, with_cues
+from tofcapture_model.data import batched, ends_of, frame_decoder, make_frame, with_cues
 from tofcapture_model.data.conditions import Seen, outside
 from tofcapture_model.data.raw_input import RawInput, from_arrays, read_input, taken
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
@@ -170,10 +170,10 @@ class Predictor:
 
     def _on_the_device(self, info: TofInfo, camera: Camera) -> _Prepared:
         """Copy the taps, and launch all the rest at once."""
-        decoder, high = TorchDecoder(info, camera, self._device), max(info.modulation_hz)
+        decoder, hz = TorchDecoder(info, camera, self._device), ends_of(info)
 
         def ask(taps: Taps) -> tuple[Tensor, ...]:
-            frame = with_cues(decoder(taps), high)
+            frame = with_cues(decoder(taps), hz)
             return *self._ask(frame), frame.valid, frame.depth, frame.confidence
 
         dark = np.zeros((len(info.modulation_hz), *camera.shape), np.float32)

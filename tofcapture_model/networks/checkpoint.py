@@ -23,7 +23,7 @@ from tofcapture.files.shard import ShardReader
 from tofcapture_model.config import Config, dumps_config, loads_config
 from tofcapture_model.networks import Model, build_model
 
-FORMAT, VERSION = "tofcapture-model", 1
+FORMAT, VERSION = "tofcapture-model", 2
 DIGITS = 12  # of a shard's SHA-256 that are enough to recognise it
 _BUNDLED = Path("bundled")  # what a user may write where a path is asked for
 _SHOWN = 5
@@ -112,7 +112,8 @@ def load_checkpoint(path: str | Path | None = None) -> tuple[Model, Config, dict
     tensors, header = read_tensors(path)
     if header.get("format") != FORMAT or header.get("version") != str(VERSION):
         raise FormatError(
-            f"{path}: expected {FORMAT} version {VERSION}, got {header.get('format')} {header.get('version')}"
+            f"{path}: expected {FORMAT} version {VERSION}, got {header.get('format')} {header.get('version')}",
+            hint="version 1 read other inputs: train again, or take the bundled network",
         )
     config = loads_config(header.get("config", ""), str(path))
     model = build_model(config)

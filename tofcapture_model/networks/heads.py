@@ -25,6 +25,7 @@ from tofcapture_model.geometry.maps import (
     side_window_planes,
     unit,
 )
+from tofcapture_model.geometry.multipath import usual_phasor
 from tofcapture_model.networks.unet import (
     CONVEX_CHANNELS,
     bilinear_logits,
@@ -33,14 +34,17 @@ from tofcapture_model.networks.unet import (
     he_initialised,
 )
 
-CUE_SCALE = (1.0, 1.0, 0.01, 0.3)  # what one may expect of each cue: most lenses scatter about one percent
+# what one may expect of each cue: most lenses scatter about one percent; the fifth is no error of the depth, but a gap
+CUE_SCALE = (1.0, 1.0, 0.01, 0.3, 1.0)
+CORRECTIONS = 4  # cues that are errors of the depth
 RESIDUAL_UNIT = 0.01  # m; a head's output of 1 moves the depth by a centimetre
 # m; where depth starts, and a head's unit, where the decoded depth is not to be seen
 MIDDLE, REACH = (0.8, 0.4)
 FIT_RADII = (1, 2)  # px of the sensor, of the planes that compact fits to its own depth
 _HEAD_WIDTH = 24
 _HOLE = 1e-3  # weight of a filled pixel
-_PHASOR_FLOOR = 1e-4  # of saturation; below it an amplitude is noise
+_PHASOR_FLOOR = 1e-4  # SIGNAL is 0.04; below it an amplitude is noise
+_LEAST_REACH, _NO_LIMIT = 0.006, 0.5  # m
 _MIN_ERROR = 1e-3  # m; the same floor as in eq. 1
 _GAIN_UNIT = 5.0  # gains learn at the pace of the weights of a layer, which move by much less than 1
 
@@ -50,6 +54,7 @@ class Features(NamedTuple):
 
     image: Tensor  #: (B, C, H, W) for the convolutions, about unit scale
     candidates: Tensor  #: (B, K, H, W) classically denoised or corrected depths, m; K may be 0
+    reach: Tensor | None  #: (B, 1, H, W) m by which physics lets the depth be wrong, or None: by anything
     normals: Tensor  #: (B, 3, H, W) unit normals to start from
     rays: Tensor  #: (B, 3, H, W) of the sensor's pixels, z = 1; a lens takes some time to invert
 
@@ -68,16 +73,19 @@ class PaperInputs(nn.Module):
             expect_channels(frame.raw, SOURCES["raw"], "paper")
         image = torch.cat([getattr(frame, s) for s in self.sources], dim=1)
         r = rays(frame.intrinsics, *frame.depth.shape[-2:])
-        return Features(image, frame.depth[:, :0], -unit(r), r)
+        return Features(image, frame.depth[:, :0], None, -unit(r), r)
 
 
 class CompactInputs(nn.Module):
-    """Compute what physics says matters: phasors, amplitudes, the frequencies' gap, cues, plane fits at some scales."""
+    """Compute what physics says matters and any camera has: reflectances, the frequencies and their gap, cues, plane fits.
+
+    Lamp, gain and contrast are divided out (``Frame.light``): a network cannot tell a camera by them.
+    """
 
     def __init__(self, windows: tuple[int, ...]) -> None:
         super().__init__()
         self.windows = windows
-        self.channels = 12 + len(CUE_SCALE) + 4 * len(windows)
+        self.channels = 11 + len(CUE_SCALE) + 4 * len(windows)
         self.register_buffer("cue_scale", torch.tensor(CUE_SCALE).reshape(1, -1, 1, 1), persistent=False)
         self.cue_scale: Tensor
 
@@ -89,7 +97,8 @@ class CompactInputs(nn.Module):
         smooth = [1 / c[:, :1].clamp_min(1e-2) for c, _ in planes]
         normals = [plane_normals(c, frame.intrinsics, r) for c, _ in planes]
         channels = [
-            *_phasor_channels(frame.phasor),
+            *_reflectances(usual_phasor(frame)),
+            *_frequencies(frame),
             (frame.depth - MIDDLE) / REACH,
             (frame.gap * 10).clamp(-2, 2),  # 20 MHz is noisy by centimetres
             (frame.cues * self.cue_scale * 100).clamp(-2, 2),  # multipath costs up to some cm
@@ -99,20 +108,33 @@ class CompactInputs(nn.Module):
             *((var.sqrt() * 50).clamp(0, 2) for _, var in planes),
             *((n[:, :2]) for n in normals),
         ]
-        corrected = frame.depth - frame.cues * self.cue_scale
-        candidates = torch.cat([*smooth, corrected], 1)
-        return Features(torch.cat(channels, 1), candidates, normals[len(normals) // 2], r)
+        errors = frame.cues[:, :CORRECTIONS] * self.cue_scale[:, :CORRECTIONS]
+        candidates = torch.cat([*smooth, frame.depth - errors], 1)
+        reach = _reach(frame, errors, planes[0][1].sqrt() * frame.depth.square())
+        return Features(torch.cat(channels, 1), candidates, reach, normals[len(normals) // 2], r)
 
 
-def _phasor_channels(phasor: Tensor) -> list[Tensor]:
-    """Direction and log amplitude of each frequency, and the log of their ratio: 2 x 3 + 1 channels."""
-    out: list[Tensor] = []
-    logs = []
-    for z in phasor.chunk(2, dim=1):
-        amplitude = z.square().sum(1, keepdim=True).sqrt()
-        out.append(z / (amplitude + _PHASOR_FLOOR))
-        logs.append((amplitude + _PHASOR_FLOOR).log() / 3 + 1)
-    return [*out, *logs, (logs[1] - logs[0]) * 3]
+def _reflectances(phasor: Tensor) -> list[Tensor]:
+    """Log amplitude of each frequency, and the log of their ratio."""
+    low, high = (z.square().sum(1, keepdim=True).sqrt() + _PHASOR_FLOOR for z in phasor.chunk(2, dim=1))
+    return [low.log() / 3 + 1, high.log() / 3 + 1, (high / low).log()]
+
+
+def _frequencies(frame: Frame) -> list[Tensor]:
+    """Octaves of the lowest and the highest frequency from the paper's, and whether there is one only, as even maps."""
+    low, high = frame.modulation[:, :1], frame.modulation[:, 1:2]
+    told = [(low / 20e6).log2() / 2, (high / 100e6).log2() / 2, (low == high).to(low)]
+    return [x[..., None, None].expand_as(frame.depth) for x in told]
+
+
+def _reach(frame: Frame, errors: Tensor, noise: Tensor) -> Tensor:
+    """Tell how wrong the decoded depth may be, (B, 1, H, W) m: by some times its noise, expected multipath, and gap.
+
+    ``errors`` (B, 4, H, W) and ``noise`` (B, 1, H, W) are in metres. Where nothing was measured there is no limit.
+    """
+    expected = errors[:, :3].abs().sum(1, keepdim=True)
+    limit = _LEAST_REACH + 4 * expected + frame.cues[:, 3:4].abs() + 4 * noise
+    return torch.where(frame.valid > 0, limit, torch.full_like(limit, _NO_LIMIT))
 
 
 def zeroed_conv(inputs: int, outputs: int) -> nn.Conv2d:
@@ -151,13 +173,17 @@ class Raw2Depth(nn.Module):
         steps = (gates * (features.candidates - frame.depth)).sum(1, keepdim=True)
         start = frame.depth if self.decoded else torch.full_like(frame.depth, MIDDLE)
         unit_of = RESIDUAL_UNIT if self.decoded else REACH
-        depth = start + steps + self._bounded(residual * unit_of)
+        depth = start + self._bounded(steps + residual * unit_of, features.reach, frame.valid)
         learned = logits if self.learned else torch.zeros_like(logits)
         return convex_upsample(depth.clamp_min(0.05), learned + self.bilinear)
 
-    def _bounded(self, residual: Tensor) -> Tensor:
-        limit = self.max_residual
-        return limit * torch.tanh(residual / limit) if limit else residual
+    def _bounded(self, change: Tensor, reach: Tensor | None, valid: Tensor) -> Tensor:
+        """Keep a change of what was measured within the reach of each pixel, and within ``max_residual`` where there is one."""
+        if reach is None and not self.max_residual:
+            return change
+        limit = torch.full_like(change, _NO_LIMIT) if reach is None else reach
+        limit = torch.where(valid > 0, limit.clamp_max(self.max_residual or torch.inf), limit)
+        return limit * torch.tanh(change / limit)
 
 
 class ErrorMap(nn.Module):

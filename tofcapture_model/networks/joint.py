@@ -8,7 +8,7 @@ from tofcapture_model.config import Network
 from tofcapture_model.frame import Estimate, Frame
 from tofcapture_model.geometry.maps import scale_intrinsics
 from tofcapture_model.networks.heads import (
-    CUE_SCALE,
+    CORRECTIONS,
     CompactInputs,
     CompactNormals,
     ErrorMap,
@@ -83,7 +83,7 @@ class CompactModel(JointModel):
     def __init__(self, network: Network) -> None:
         super().__init__()
         self.inputs, width = CompactInputs(network.windows), network.width
-        candidates = len(network.windows) + len(CUE_SCALE)
+        candidates = len(network.windows) + CORRECTIONS
         self.backbone = UNet(self.inputs.channels, width, width, network.levels)
         depth_net = zeroed_conv(width, candidates + 1 + CONVEX_CHANNELS)
         self.raw2depth = Raw2Depth(depth_net, network, candidates=candidates)

@@ -259,7 +259,7 @@ class Run:
         self._tell(stage, "reads its first frames")
         while not self._done(stage):
             keys = epoch_batches(
-                len(data), training.batch, training.seed, position.epoch, self.group.rank, self.group.world
+                data.kinds, training.batch, training.seed, position.epoch, self.group.rank, self.group.world
             )
             left = keys[position.batch :]
             for frame, target in DataLoader(

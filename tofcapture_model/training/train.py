@@ -17,7 +17,7 @@ from tofcapture.cli.kit import Report
 from tofcapture.files.manifest import load_manifest
 from tofcapture_model.config import Config, Stage, preset
 from tofcapture_model.data import FrameDataset, spare_memory
-from tofcapture_model.data.augment import BurstNoise, redraw_calibration, redraw_frame
+from tofcapture_model.data.augment import redraw_calibration, redraw_frame
 from tofcapture_model.data.conditions import seen_by
 from tofcapture_model.evaluation.evaluate import calibrate
 from tofcapture_model.frame import Estimate, Frame
@@ -119,7 +119,7 @@ def train(
             for stage in config.stages[run.position.stage :]:
                 learner = Learner(model, config, stage, group, run.moments)
                 for frame, target in run.batches(data, stage, workers):
-                    seen = learner.augmented(frame, data.burst, run.position)
+                    seen = learner.augmented(frame, run.position)
                     estimate = learner.forward(seen)
                     loss = training_loss(model, config.losses, stage.name, estimate, target, seen)
                     run.expect_finite("loss", float(loss.total.detach()))
@@ -154,15 +154,15 @@ class Learner:
                     k: v if k == "step" else torch.empty_like(parameter).copy_(v) for k, v in saved.items()
                 }
 
-    def augmented(self, frame: Frame, burst: BurstNoise | None, position: Position) -> Frame:
+    def augmented(self, frame: Frame, position: Position) -> Frame:
         """Draw the noise of means of bursts anew, and another calibration where the configuration asks for it.
 
         The position seeds what is drawn: a resumed run draws what an unbroken one would have.
         """
         seed = f"{self.training.seed}/{position.stage}/{position.step}/{self.group.rank}"
         drawn = torch.Generator(self.group.device).manual_seed(zlib.crc32(seed.encode()))
-        if burst:
-            frame = redraw_frame(frame, drawn, burst)
+        if self.training.noise == "drawn":
+            frame = redraw_frame(frame, drawn)
         if self.training.phase_error:
             frame = redraw_calibration(frame, drawn, self.training.phase_error)
         return frame

@@ -128,6 +128,11 @@ def read_constants(overrides: Mapping[str, Any], where: str) -> Constants:
     )
 
 
+def presets() -> tuple[str, ...]:
+    """Name the cameras of cameras.toml."""
+    return tuple(_shipped("cameras.toml"))
+
+
 def _shipped(name: str) -> dict[str, Any]:
     return tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
 
