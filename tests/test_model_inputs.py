@@ -15,8 +15,8 @@ from tests.test_model_geometry import CAMERA, plane
 from tests.test_model_multipath import HZ, SHAPE, K, corner
 from tests.test_model_networks import TINY_COMPACT, frame
 from tofcapture.rig import SPEED_OF_LIGHT
-from tofcapture_model.evaluation.metrics import angles_deg
 from tofcapture_model.data import with_cues
+from tofcapture_model.evaluation.metrics import angles_deg
 from tofcapture_model.frame import Frame
 from tofcapture_model.geometry import multipath
 from tofcapture_model.geometry.maps import (

@@ -199,7 +199,9 @@ def test_expected_interreflection_does_not_depend_on_the_lens():
         phasor = torch.cat(
             [torch.zeros(1, 2, *camera.shape), amplitude * phase.cos(), amplitude * phase.sin()], 1
         )
-        seen = cues(phasor, depth, torch.ones_like(depth), torch.zeros_like(depth), numbers(camera), (2e7, 1e8))
+        seen = cues(
+            phasor, depth, torch.ones_like(depth), torch.zeros_like(depth), numbers(camera), (2e7, 1e8)
+        )
         maps.append(seen[0, :2])
     x, y, _ = rays_of(LENS)[0]
     grid = torch.stack(

@@ -148,7 +148,9 @@ def test_the_residual_is_bounded_where_asked():
         model.raw2depth.net.bias[model.raw2depth.candidates] = 1e6
     data = frame()
     data = data._replace(depth=torch.full_like(data.depth, 0.8), cues=torch.zeros_like(data.cues))
-    torch.testing.assert_close(model(data).depth, torch.full((2, 1, 72, 88), 0.806))  # nothing says it is wrong
+    torch.testing.assert_close(
+        model(data).depth, torch.full((2, 1, 72, 88), 0.806)
+    )  # nothing says it is wrong
     data.cues[:, 0] = 0.01
     torch.testing.assert_close(model(data).depth, torch.full((2, 1, 72, 88), 0.82))
     data.valid[:] = 0  # what was not measured may be anywhere

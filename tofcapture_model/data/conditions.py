@@ -19,6 +19,7 @@ from tofcapture_model.data import FrameDataset
 Seen = Mapping[str, Any]
 _FRAMES = 24  # that are looked at for their brightness
 _ALIKE = 0.02  # share by which a frequency may differ
+_MANY = 8  # sets of frequencies, of one number, between which others are known as well
 _BEYOND = {"rows": 1.5, "columns": 1.5, "field_of_view_deg": 1.15, "brightness": 2.0}
 _WORDS = {"rows": "rows", "columns": "columns", "field_of_view_deg": "degrees of view", "brightness": "of saturation in brightness"}  # fmt: skip
 """Factor beyond the range that is still taken for the same, and what a number is called."""
@@ -54,10 +55,14 @@ def outside(seen: Seen | None, modulation_hz: tuple[float, ...], camera: Camera,
         return ""
     said, known = [], [tuple(hz) for hz in seen.get("modulation_hz", ())]
     asked = frequencies(modulation_hz)
-    if known and not any(
-        len(hz) == len(asked) and np.allclose(hz, asked, rtol=_ALIKE, atol=0) for hz in known
-    ):
-        said.append(f"{_megahertz(asked)} MHz instead of {' or '.join(map(_megahertz, known))}")
+    alike = [hz for hz in known if len(hz) == len(asked)]
+    if len(alike) >= _MANY:  # so many cameras that others between them are no strangers
+        low, high = min(map(min, alike)) / (1 + _ALIKE), max(map(max, alike)) * (1 + _ALIKE)
+        if not low <= min(asked) <= max(asked) <= high:
+            said.append(f"{_megahertz(asked)} MHz instead of {low / 1e6:.3g} to {high / 1e6:.3g}")
+    elif known and not any(np.allclose(hz, asked, rtol=_ALIKE, atol=0) for hz in alike):
+        instead = " or ".join(map(_megahertz, known[:_MANY]))
+        said.append(f"{_megahertz(asked)} MHz instead of {instead}")
     values = {**_camera(camera), "brightness": brightness}
     for name, factor in _BEYOND.items():
         low, high = seen.get(name, (0.0, math.inf))

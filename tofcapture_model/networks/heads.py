@@ -7,6 +7,7 @@ training can only be judged by what it adds.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -45,6 +46,10 @@ _HEAD_WIDTH = 24
 _HOLE = 1e-3  # weight of a filled pixel
 _PHASOR_FLOOR = 1e-4  # SIGNAL is 0.04; below it an amplitude is noise
 _LEAST_REACH, _NO_LIMIT = 0.006, 0.5  # m
+_TAIL, _MARGIN = (
+    1e-3,
+    0.25,
+)  # of a channel's values that count as strange in training; of its range that is allowed beyond
 _MIN_ERROR = 1e-3  # m; the same floor as in eq. 1
 _GAIN_UNIT = 5.0  # gains learn at the pace of the weights of a layer, which move by much less than 1
 
@@ -55,6 +60,7 @@ class Features(NamedTuple):
     image: Tensor  #: (B, C, H, W) for the convolutions, about unit scale
     candidates: Tensor  #: (B, K, H, W) classically denoised or corrected depths, m; K may be 0
     reach: Tensor | None  #: (B, 1, H, W) m by which physics lets the depth be wrong, or None: by anything
+    trust: Tensor | None  #: (B, 1, H, W) 1 where all that is read is like what was learned from, 0 where not
     normals: Tensor  #: (B, 3, H, W) unit normals to start from
     rays: Tensor  #: (B, 3, H, W) of the sensor's pixels, z = 1; a lens takes some time to invert
 
@@ -73,7 +79,7 @@ class PaperInputs(nn.Module):
             expect_channels(frame.raw, SOURCES["raw"], "paper")
         image = torch.cat([getattr(frame, s) for s in self.sources], dim=1)
         r = rays(frame.intrinsics, *frame.depth.shape[-2:])
-        return Features(image, frame.depth[:, :0], None, -unit(r), r)
+        return Features(image, frame.depth[:, :0], None, None, -unit(r), r)
 
 
 class CompactInputs(nn.Module):
@@ -88,6 +94,26 @@ class CompactInputs(nn.Module):
         self.channels = 11 + len(CUE_SCALE) + 4 * len(windows)
         self.register_buffer("cue_scale", torch.tensor(CUE_SCALE).reshape(1, -1, 1, 1), persistent=False)
         self.cue_scale: Tensor
+        ends = torch.tensor([-torch.inf, torch.inf])
+        self.register_buffer("familiar", ends[:, None].repeat(1, self.channels))
+        self.familiar: (
+            Tensor  #: (2, C) least and largest value of each channel in training; see :meth:`remember`
+        )
+
+    def remember(self, images: Iterable[Tensor]) -> None:
+        """Take the range of each channel over images (B, C, H, W) that were learned from, and what was taken before."""
+        tails = torch.tensor([_TAIL, 1 - _TAIL])
+        seen = torch.stack(
+            [torch.quantile(x.float().cpu().transpose(0, 1).flatten(1), tails, dim=1) for x in images]
+        )
+        low, high = seen[:, 0].amin(0), seen[:, 1].amax(0)
+        margin = _MARGIN * (high - low)
+        found = torch.stack([low - margin, high + margin]).to(self.familiar)
+        before = self.familiar.nan_to_num(
+            posinf=-torch.inf, neginf=torch.inf
+        )  # the whole line is no knowledge
+        self.familiar[0] = torch.minimum(found[0], before[0])
+        self.familiar[1] = torch.maximum(found[1], before[1])
 
     @torch.no_grad()
     def forward(self, frame: Frame) -> Features:
@@ -111,7 +137,17 @@ class CompactInputs(nn.Module):
         errors = frame.cues[:, :CORRECTIONS] * self.cue_scale[:, :CORRECTIONS]
         candidates = torch.cat([*smooth, frame.depth - errors], 1)
         reach = _reach(frame, errors, planes[0][1].sqrt() * frame.depth.square())
-        return Features(torch.cat(channels, 1), candidates, reach, normals[len(normals) // 2], r)
+        image = torch.cat(channels, 1)
+        return Features(image, candidates, reach, self._trust(image), normals[len(normals) // 2], r)
+
+    def _trust(self, image: Tensor) -> Tensor:
+        """Tell where every channel is within what was learned from, (B, 1, H, W); a few strangers are noise."""
+        if self.training:
+            return torch.ones_like(image[:, :1])
+        low, high = self.familiar[:, None, :, None, None]
+        strange = ((image < low) | (image > high)).any(1, keepdim=True).to(image)
+        near = F.avg_pool2d(strange, 5, 1, 2, count_include_pad=False)
+        return 1 - (4 * near).clamp_max(1.0)
 
 
 def _reflectances(phasor: Tensor) -> list[Tensor]:
@@ -173,7 +209,11 @@ class Raw2Depth(nn.Module):
         steps = (gates * (features.candidates - frame.depth)).sum(1, keepdim=True)
         start = frame.depth if self.decoded else torch.full_like(frame.depth, MIDDLE)
         unit_of = RESIDUAL_UNIT if self.decoded else REACH
-        depth = start + self._bounded(steps + residual * unit_of, features.reach, frame.valid)
+        change = self._bounded(steps + residual * unit_of, features.reach, frame.valid)
+        if features.trust is not None:  # what nothing like it was learned from: the sensor's depth, smoothed
+            smooth = self._bounded(features.candidates[:, :1] - frame.depth, features.reach, frame.valid)
+            change = torch.lerp(smooth, change, features.trust)
+        depth = start + change
         learned = logits if self.learned else torch.zeros_like(logits)
         return convex_upsample(depth.clamp_min(0.05), learned + self.bilinear)
 
@@ -198,12 +238,15 @@ class ErrorMap(nn.Module):
         self.register_buffer("calibration", torch.ones(()))  # set after training, see evaluate.calibrate
         self.calibration: Tensor
 
-    def forward(self, shared: Tensor, depth: Tensor, frame: Frame) -> Tensor:
-        """Return (B, 1, 2H, 2W), metres, positive."""
+    def forward(self, shared: Tensor, features: Features, depth: Tensor, frame: Frame) -> Tensor:
+        """Return (B, 1, 2H, 2W), metres, positive; at least what physics allows where nothing like it was learned from."""
         fine = F.pixel_unshuffle(depth.detach(), 2)
         seen = (fine - frame.depth) * 20 if self.decoded else (fine - MIDDLE) / REACH
         out = self.net(torch.cat([shared, seen.clamp(-2, 2)], dim=1)).float()
-        return F.softplus(F.pixel_shuffle(out, 2)) * (RESIDUAL_UNIT * self.calibration)
+        error = F.softplus(F.pixel_shuffle(out, 2)) * (RESIDUAL_UNIT * self.calibration)
+        if features.trust is None or features.reach is None:
+            return error
+        return error + doubled((1 - features.trust) * features.reach)
 
 
 class PaperNormals(nn.Module):
@@ -242,6 +285,8 @@ class CompactNormals(nn.Module):
         out = _planes(self.net(torch.cat([shared, features.normals, *fitted], dim=1)))
         # sub-pixels side by side until the end: interleaving each term costs more than the convolutions
         parts = torch.unflatten(out, 1, (-1, 4))
+        if features.trust is not None:
+            parts = parts * features.trust[:, None]
         normals = doubled_parts(features.normals) + parts[:, :3]
         for k, n in enumerate(fitted, 3):
             normals = torch.addcmul(normals, parts[:, k : k + 1], doubled_parts(n - features.normals))

@@ -42,7 +42,7 @@ class JointModel(nn.Module):
         """
         features, shared = self.read(frame)
         depth = doubled(frame.depth) if stage == "normal" else self.raw2depth(shared, features, frame)
-        error = self.error_map(shared, depth, frame)
+        error = self.error_map(shared, features, depth, frame)
         if stage == "depth":
             normals = doubled(features.normals)
         else:

@@ -16,15 +16,15 @@ from torch import nn
 from tofcapture.cli.kit import Report
 from tofcapture.files.manifest import load_manifest
 from tofcapture_model.config import Config, Stage, preset
-from tofcapture_model.data import FrameDataset, spare_memory
+from tofcapture_model.data import FrameDataset, batched, spare_memory
 from tofcapture_model.data.augment import redraw_calibration, redraw_frame
 from tofcapture_model.data.conditions import seen_by
 from tofcapture_model.evaluation.evaluate import calibrate
-from tofcapture_model.frame import Estimate, Frame
+from tofcapture_model.frame import Estimate, Frame, frame_to
 from tofcapture_model.losses import Objective
 from tofcapture_model.networks import Model, build_model, compile_unets, select_stage, training_loss
 from tofcapture_model.networks.checkpoint import find_model, save_model
-from tofcapture_model.networks.joint import JointModel
+from tofcapture_model.networks.joint import CompactModel, JointModel
 from tofcapture_model.training import (
     Group,
     Moments,
@@ -40,6 +40,7 @@ from tofcapture_model.training.card import write_card
 
 WARM_UP = 0.02  # of a stage, with a cosine schedule
 MAX_NORM = 1.0  # of the gradient
+_REMEMBERED = 300  # samples whose values a network remembers as familiar
 
 
 def train(
@@ -131,6 +132,8 @@ def train(
                     run.save_now_and_then(learner.moments(), now=stop)
                     if stop:
                         return run.ended()
+            if isinstance(model, CompactModel):
+                _remember(model, data, group.device)
         if group.rank == 0:
             _finish(run, source)
             run.save_now_and_then(learner.moments(), now=True)
@@ -197,6 +200,13 @@ def scheduled_rate(stage: Stage, schedule: str, progress: float) -> float:
         return stage.learning_rate
     cosine = max(0.5 * (1 + math.cos(math.pi * progress)), 1e-3)
     return stage.learning_rate * min(1.0, 0.1 + progress / WARM_UP) * cosine
+
+
+def _remember(model: CompactModel, data: FrameDataset, device: torch.device) -> None:
+    """Show a network once more some of what it learned from, so that it knows what is strange to it."""
+    some = range(0, len(data), math.ceil(len(data) / _REMEMBERED))
+    frames = (frame_to(batched(data[(0, i)][0]), device) for i in some)
+    model.inputs.remember(model.inputs(frame).image for frame in frames)
 
 
 def _finish(run: Run, source: Mapping[str, Any]) -> None:
