@@ -7,14 +7,20 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from tests import until
 from tests.test_sim_world import SMALL
+from tofcapture.channels import frequencies
 from tofcapture.cli import main
+from tofcapture.devices.sim.config import read_constants
+from tofcapture.devices.sim.draw import draw_camera
 from tofcapture.errors import ConfigError
 from tofcapture.files.manifest import load_manifest
 from tofcapture.files.shard import ShardReader
+from tofcapture.frames import TofInfo
+from tofcapture.ops.phase import Decoder
 from tofcapture.suites import capture
 from tofcapture.suites.make import DatasetSpec, make_one
 from tofcapture.suites.run import simulate_dataset
@@ -89,7 +95,7 @@ def test_shards_tell_where_they_came_from(whole):
 
 
 def test_scenes_take_turns_with_cameras(tmp_path):
-    """Two rigs: other factory calibration and fixed pattern, scene by scene; one split for all if wanted."""
+    """Two cameras drawn whole, scene by scene; one split for all if wanted."""
     two = replace(spec(scenes=3), cameras=2, views=1)
     simulate_dataset(two, tmp_path / "data", jobs=1, split="test")
     manifest = load_manifest(tmp_path / "data")
@@ -102,6 +108,41 @@ def test_scenes_take_turns_with_cameras(tmp_path):
             offsets.append(shard.info.range_errors[0].offset)
     assert serials[0] == serials[2] != serials[1]
     assert offsets[0] == offsets[2] != offsets[1]
+
+
+def test_drawn_cameras_are_as_different_as_cameras_are():
+    """One to three frequencies, three phases and four, signed taps, wide and narrow, bright and dark: each one decodes what it sees."""
+    drawn = [draw_camera(np.random.default_rng(seed)) for seed in range(60)]
+    constants = [read_constants(tables, f"camera {k}") for k, tables in enumerate(drawn)]
+    counts = {len(frequencies(c.sensor.modulation_hz)) for c in constants}
+    assert counts == {1, 2, 3}
+    assert {c.sensor.offset for c in constants} == {True, False}
+    fields = [np.degrees(2 * np.arctan(c.tof.width / 2 / c.tof.fx)) for c in constants]
+    assert min(fields) < 50
+    assert max(fields) > 85
+    white = [c.sensor.signal[-1] * c.sensor.contrast[-1] / c.sensor.full_scale for c in constants]
+    assert max(white) > 10 * min(white)
+    for c in constants[:8]:
+        s = c.sensor
+        Decoder(
+            TofInfo(
+                "drawn", "1", c.tof, c.illuminator, s.modulation_hz, s.phase_rad,
+                offset=s.offset, range_errors=s.range_errors, saturation=s.full_scale,
+            )
+        )  # fmt: skip
+
+
+def test_a_drawn_camera_of_a_make_has_its_channels_and_its_image():
+    """What differs between two cameras of one make does; what the maker says does not."""
+    made = [
+        read_constants(draw_camera(np.random.default_rng(seed), "real3-60-80"), "drawn") for seed in (1, 2)
+    ]
+    maker = read_constants({"tof": {"preset": "real3-60-80"}}, "preset")
+    for one in made:
+        assert one.sensor.modulation_hz == maker.sensor.modulation_hz
+        assert one.tof == maker.tof
+    assert made[0].sensor.contrast != made[1].sensor.contrast
+    assert made[0].sensor.range_errors != made[1].sensor.range_errors
 
 
 def test_interrupted_in_the_middle_of_a_scene(tmp_path, whole, monkeypatch):

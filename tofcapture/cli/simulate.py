@@ -94,7 +94,7 @@ def _run_dataset(args: argparse.Namespace) -> Outcome:
         raise UsageError(f"--seed: expected a whole number from 0 on, got {args.seed}")
     if args.meshes is not None and args.suite != "tof100":
         raise UsageError(f"--meshes: the suite {args.suite} takes no meshes", hint="--suite tof100")
-    meshes = () if args.meshes is None else table_meshes(args.meshes, args.mesh_unit, args.seed)
+    meshes, unfit = ((), ()) if args.meshes is None else table_meshes(args.meshes, args.mesh_unit, args.seed)
     tables = {} if args.station is None else read_station(args.station).get("sim", {})
     same = {
         k: getattr(args, k) for k in ("suite", "seed", "scenes", "views", "frames", "mesh_unit", "cameras")
@@ -105,7 +105,7 @@ def _run_dataset(args: argparse.Namespace) -> Outcome:
         result = simulate_dataset(
             spec, args.out, args.jobs, lambda done, total: report("views", done, total), args.split
         )
-    data = _data(result)
+    data = _data(result) | {"left_out": [path.name for path in unfit]}
     return Outcome(data, _text(data), following=f"tofcapture train {args.out} --out run")
 
 
@@ -140,6 +140,8 @@ def _text(data: dict[str, Any]) -> str:
     lines = [
         f"{data['dataset']}: {counted(data['scenes'], 'scene')}, {counted(data['views'], 'view')}, {data['bytes'] / 1e9:.2f} GB in {data['seconds']:.0f} s"
     ]
+    if data["left_out"]:
+        lines.append(f"left out, not of 3 to 30 cm or damaged: {', '.join(data['left_out'])}")
     if data["kept"]:
         lines.append(f"{len(data['kept'])} scenes were there already")
     if data["seconds_per_view"] is not None:

@@ -144,8 +144,8 @@ def _sheets(most: int, materials: Mapping[str, Any], rng: np.random.Generator) -
     return out
 
 
-def table_meshes(folder: Path, mesh_unit: str, seed: int) -> tuple[Path, ...]:
-    """List the meshes of a folder that fit on the table and under the arm, in a seeded order.
+def table_meshes(folder: Path, mesh_unit: str, seed: int) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """List the meshes of a folder that fit on the table and under the arm, in a seeded order, and those that do not.
 
     Raises :class:`ConfigError`: no folder, or no mesh of a fitting size in it.
     """
@@ -165,4 +165,4 @@ def table_meshes(folder: Path, mesh_unit: str, seed: int) -> tuple[Path, ...]:
             hint=f"are they in {mesh_unit}? see --mesh-unit",
         )
     order = generator("meshes", seed, "suite meshes").permutation(len(fit))
-    return tuple(fit[int(i)] for i in order)
+    return tuple(fit[int(i)] for i in order), tuple(p for p in paths if p not in fit)

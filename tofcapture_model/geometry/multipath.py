@@ -31,7 +31,10 @@ _FAR = 3.0  # m
 _GRAZING = 0.15  # cosine below which the direct light of a patch says nothing
 _FAINT = 1e-3  # below it an amplitude is noise
 _TINY = 1e-12
-_PALE, _PALENESS = 0.9, 0.5  # quantile of brightness that is taken for pale, and the albedo of that on average
+_PALE, _PALENESS = (
+    0.9,
+    0.5,
+)  # quantile of brightness that is taken for pale, and the albedo of that on average
 
 
 def light(phasor: Tensor, depth: Tensor, valid: Tensor, intrinsics: Tensor) -> Tensor:

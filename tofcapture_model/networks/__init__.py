@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import torch
 from torch import nn
+from torch.nn import functional as F  # noqa: N812
 
 from tofcapture.errors import ConfigError
 from tofcapture_model.config import Config, Losses
@@ -22,6 +23,7 @@ from tofcapture_model.networks.joint import CompactModel, JointModel, PaperModel
 from tofcapture_model.networks.unet import UNet
 
 Model = JointModel | Baseline
+_WRAPPED = 0.3  # m by which a depth is wrong that was unwrapped wrongly
 
 PARTS = {
     "depth": ("raw2depth", "error_map"),
@@ -86,4 +88,14 @@ def training_loss(
     if isinstance(model, Baseline):
         loss = model.loss(estimate, target, frame)
         return Objective(loss, {"depth": loss}, torch.zeros(7))
-    return objective(weights, stage, estimate, target, scale_intrinsics(frame.intrinsics, 2))
+    return objective(
+        weights, stage, estimate, _unwrapped(target, frame), scale_intrinsics(frame.intrinsics, 2)
+    )
+
+
+def _unwrapped(target: Target, frame: Frame) -> Target:
+    """Leave out what was measured a wrap away: no network moves a depth so far, and one such pixel outweighs hundreds."""
+    decoded = F.interpolate(frame.depth, scale_factor=2, mode="nearest")
+    valid = F.interpolate(frame.valid, scale_factor=2, mode="nearest") > 0
+    near = ~valid | ((decoded - target.depth).abs() < _WRAPPED)
+    return target._replace(good=target.good & near, context=target.context & near)
