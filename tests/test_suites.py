@@ -121,6 +121,7 @@ def test_meshes_take_their_turn(tmp_path):
         (tmp_path / f"{name}.ply").write_text(PLY.format(size=size))
     meshes, others = table_meshes(tmp_path, "mm", 0)
     assert {p.stem for p in meshes} == {"one", "two"}
+    assert {p.stem for p in others} == {"big", "dust"}
     names = [s.name for s in scenes("tof100", 26, meshes=meshes) if s.facts["kind"] == "mesh"]
     assert sorted(names) == sorted([f"{meshes[0].stem}-1", f"{meshes[1].stem}-1", f"{meshes[0].stem}-2"])
     with pytest.raises(ConfigError, match="none of 4 meshes"):
@@ -133,7 +134,7 @@ def test_kinds_replace_the_pattern_and_every_mesh_has_its_turn(tmp_path):
     """With three meshes in five scenes, no two scenes share a name; unknown kinds and other suites are refused."""
     for name in ("one", "two", "three"):
         (tmp_path / f"{name}.ply").write_text(PLY.format(size=80))
-    meshes, others = table_meshes(tmp_path, "mm", 0)
+    meshes, _ = table_meshes(tmp_path, "mm", 0)
     spec = DatasetSpec("tof100", 0, 10, meshes=meshes, kinds=("mesh", "object", "mesh", "dark", "mesh"))
     made = [make_scene(spec.recipe(), i, 0, meshes) for i in range(10)]
     assert [m.facts["kind"] for m in made] == list(spec.kinds) * 2
