@@ -101,14 +101,23 @@ class Objective(NamedTuple):
 
 
 def objective(
-    weights: Losses, stage: str, estimate: Estimate, target: Target, intrinsics: Tensor
+    weights: Losses,
+    stage: str,
+    estimate: Estimate,
+    target: Target,
+    intrinsics: Tensor,
+    share: Tensor | None = None,
 ) -> Objective:
     """Weigh the losses that take part in a stage; ``intrinsics`` (B, 4 or 12) are of the estimate's grid.
+
+    ``share`` (B, 1, 1, 1) is by how much each image counts, 1 where nothing is said.
 
     ``depth``: eq. 1, eq. 2 and the error map on the initial depth. ``normal``: eq. 3 on the initial normals. ``refine``: eq. 1
     and eq. 3 on the refined maps. ``joint``: everything on the refined maps.
     """
     weight = target.good.float() + weights.context * target.context.float()
+    if share is not None:
+        weight = weight * share
     depth = estimate.initial_depth if stage == "depth" else estimate.depth
     normals = estimate.initial_normals if stage == "normal" else estimate.normals
     parts: dict[str, Tensor] = {}
@@ -129,4 +138,6 @@ def objective(
     if stage != "depth":
         distance = angle_loss if weights.normals == "angle" else cosine_loss
         parts["normal"] = weights.normal * distance(normals, target.normals, weight)
+    if share is not None:  # means are over weights: a batch that counts little is a small step
+        parts = {name: part * share.mean() for name, part in parts.items()}
     return Objective(torch.stack(list(parts.values())).sum(), parts, winners)

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture.errors import ConfigError
@@ -88,9 +88,16 @@ def training_loss(
     if isinstance(model, Baseline):
         loss = model.loss(estimate, target, frame)
         return Objective(loss, {"depth": loss}, torch.zeros(7))
-    return objective(
-        weights, stage, estimate, _unwrapped(target, frame), scale_intrinsics(frame.intrinsics, 2)
-    )
+    target, fine = _unwrapped(target, frame), scale_intrinsics(frame.intrinsics, 2)
+    return objective(weights, stage, estimate, target, fine, _share(target, frame, weights.delta))
+
+
+def _share(target: Target, frame: Frame, delta: float) -> Tensor:
+    """Let an image (B, 1, 1, 1) count by the inverse of its sensor's error: a camera of centimetres must not outweigh ten of millimetres."""
+    decoded = F.interpolate(frame.depth, scale_factor=2, mode="nearest")
+    good = target.good.float()
+    wrong = ((decoded - target.depth).abs().clamp_max(_WRAPPED) * good).sum((1, 2, 3), keepdim=True)
+    return 1 / (wrong / good.sum((1, 2, 3), keepdim=True).clamp_min(1) / delta).clamp_min(1)
 
 
 def _unwrapped(target: Target, frame: Frame) -> Target:
