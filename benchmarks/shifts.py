@@ -348,7 +348,7 @@ def station_sim() -> Sim:
 
 def render(args: argparse.Namespace) -> None:
     """Simulate every dataset that is not there, scene by scene."""
-    meshes = table_meshes(args.meshes, "mm", SEED) if args.meshes else ()
+    meshes = table_meshes(args.meshes, "mm", SEED)[0] if args.meshes else ()
     same: dict[str, Any] = {
         "suite": "tof100",
         "views": args.views,

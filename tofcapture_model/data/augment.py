@@ -67,12 +67,12 @@ def _phasors(frame: Frame, raw: Tensor) -> tuple[Tensor, ...]:
     return phasors.chunk(phasors.shape[1] // 2, dim=1)
 
 
-def redraw_calibration(frame: Frame, generator: torch.Generator, radians: float) -> Frame:
+def redraw_calibration(frame: Frame, generator: torch.Generator, radians: float | Tensor) -> Frame:
     """Give each frame of a batch another calibration error, as another camera of the make would have.
 
     A part of each frequency's systematic error is never known: ``sum_m (a_m cos m phi + b_m sin m phi)`` over the measured phase
     phi, m = 0, 2, 4, as :class:`tofcapture.rig.RangeError` writes it. Drawn anew, no network learns a few cameras by heart.
-    ``radians`` is the standard deviation of each amplitude; a camera's error varies by ``sqrt(3)`` times this. Depth, gap and the
+    ``radians``, one or (B, 1, 1, 1), is the standard deviation of each amplitude; a camera's error varies by ``sqrt(3)`` times this. Depth, gap and the
     gap's cue move; raw, phasors and confidence are what was measured.
     """
     phasors = (frame.phasor[:, :2], frame.phasor[:, 2:], *_phasors(frame, frame.raw)[2:])

@@ -40,6 +40,10 @@ from tofcapture_model.training.card import write_card
 
 WARM_UP = 0.02  # of a stage, with a cosine schedule
 MAX_NORM = 1.0  # of the gradient
+_UNCALIBRATED, _UNCALIBRATED_RAD = (
+    0.12,
+    0.03,
+)  # share of frames of a camera that nobody calibrated, and its error
 _REMEMBERED = 300  # samples whose values a network remembers as familiar
 
 
@@ -167,7 +171,10 @@ class Learner:
         if self.training.noise == "drawn":
             frame = redraw_frame(frame, drawn)
         if self.training.phase_error:
-            frame = redraw_calibration(frame, drawn, self.training.phase_error)
+            size = (len(frame.depth), 1, 1, 1)
+            nobody = torch.rand(size, generator=drawn, device=self.group.device) < _UNCALIBRATED
+            radians = torch.where(nobody, _UNCALIBRATED_RAD, self.training.phase_error)
+            frame = redraw_calibration(frame, drawn, radians)
         return frame
 
     def forward(self, frame: Frame) -> Estimate:
