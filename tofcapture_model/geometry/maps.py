@@ -30,7 +30,8 @@ _INVERTED = 1e-4  # of a ray's x and y at z = 1
 
 def intrinsics_of(camera: Camera) -> Tensor:
     """Return (4,) float32 of a pinhole, (12,) of a camera with a lens."""
-    found = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
+    found = torch.tensor(numbers, dtype=torch.float32)  # those of numpy would make all that follows double
     return with_lens(found) if camera.distortion else found
 
 
