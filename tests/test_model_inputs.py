@@ -13,7 +13,7 @@ from torch.nn import functional as F  # noqa: N812
 
 from tests.test_model_geometry import CAMERA, plane
 from tests.test_model_multipath import HZ, SHAPE, K, corner
-from tests.test_model_networks import TINY_COMPACT, frame
+from tests.test_model_networks import TINY_COMPACT, frame, joint
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.data import with_cues
 from tofcapture_model.evaluation.metrics import angles_deg
@@ -246,3 +246,30 @@ def test_what_a_network_reads_knows_neither_lamp_nor_gain_nor_contrast():
     for gains in ((0.25, 0.25), (1.0, 0.9)):
         torch.testing.assert_close(seen(*gains), seen(1.0, 1.0), atol=2e-3, rtol=0)
     assert (seen(1.0, 1.0)[..., :40, :] - seen(1.0, 1.0)[..., 40:80, :]).abs().max() > 0.1
+
+
+def test_what_is_unlike_all_that_was_learned_from_is_the_sensor_s_smoothed_and_unsure():
+    """A strange patch falls back there and nowhere else; what was learned from before stays familiar."""
+    torch.manual_seed(0)
+    model, data = joint(TINY_COMPACT).eval(), frame(batch=1)
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            if name.endswith("net.bias"):
+                parameter.add_(0.3)
+        free = model(data)
+        model.inputs.remember([model.inputs(frame(batch=1, seed=k)).image for k in range(8)])
+        known = model(data)
+        strange = data._replace(cues=data.cues.clone())
+        strange.cues[..., :12, :12] = 0.1  # ten times what there was
+        model.inputs.remember([model.inputs(frame(batch=1, seed=9)).image])
+        found = model(strange)
+        features = model.inputs(strange)
+    assert (
+        (known.depth - free.depth).abs() < 1e-5
+    ).float().mean() > 0.95  # numbers at random have their tails
+    smooth = features.candidates[:, :1] - data.depth
+    patch, far = (..., slice(8, 16), slice(8, 16)), (..., slice(48, 60), slice(48, 60))
+    apart = (found.depth - doubled(data.depth + smooth))[patch].abs()
+    assert apart.max() < 0.5 * smooth.abs().max() + 1e-3
+    assert (found.error - known.error)[patch].min() > 0.005
+    assert ((found.depth - known.depth)[far].abs() < 1e-5).float().mean() > 0.95

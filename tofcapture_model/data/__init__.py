@@ -104,7 +104,9 @@ def make_frame(
 
 def ends_of(info: TofInfo) -> tuple[float, float]:
     """Name the lowest and the highest frequency, Hz."""
-    return float(min(info.modulation_hz)), float(max(info.modulation_hz))  # no scalar of numpy, which makes tensors double
+    return float(min(info.modulation_hz)), float(
+        max(info.modulation_hz)
+    )  # no scalar of numpy, which makes tensors double
 
 
 def with_cues(frame: Frame, hz: tuple[float, float]) -> Frame:

@@ -46,6 +46,7 @@ _HEAD_WIDTH = 24
 _HOLE = 1e-3  # weight of a filled pixel
 _PHASOR_FLOOR = 1e-4  # SIGNAL is 0.04; below it an amplitude is noise
 _LEAST_REACH, _NO_LIMIT = 0.006, 0.5  # m
+_ANYTHING = 6e4  # float16 holds it
 _TAIL, _MARGIN = (
     1e-3,
     0.25,
@@ -94,11 +95,9 @@ class CompactInputs(nn.Module):
         self.channels = 11 + len(CUE_SCALE) + 4 * len(windows)
         self.register_buffer("cue_scale", torch.tensor(CUE_SCALE).reshape(1, -1, 1, 1), persistent=False)
         self.cue_scale: Tensor
-        ends = torch.tensor([-torch.inf, torch.inf])
+        ends = torch.tensor([-_ANYTHING, _ANYTHING])
         self.register_buffer("familiar", ends[:, None].repeat(1, self.channels))
-        self.familiar: (
-            Tensor  #: (2, C) least and largest value of each channel in training; see :meth:`remember`
-        )
+        self.familiar: Tensor  #: (2, C) least and largest value of each channel in training
 
     def remember(self, images: Iterable[Tensor]) -> None:
         """Take the range of each channel over images (B, C, H, W) that were learned from, and what was taken before."""
@@ -109,9 +108,8 @@ class CompactInputs(nn.Module):
         low, high = seen[:, 0].amin(0), seen[:, 1].amax(0)
         margin = _MARGIN * (high - low)
         found = torch.stack([low - margin, high + margin]).to(self.familiar)
-        before = self.familiar.nan_to_num(
-            posinf=-torch.inf, neginf=torch.inf
-        )  # the whole line is no knowledge
+        nothing = self.familiar.abs() >= _ANYTHING  # no knowledge, which widens nothing
+        before = torch.where(nothing, found, self.familiar)
         self.familiar[0] = torch.minimum(found[0], before[0])
         self.familiar[1] = torch.maximum(found[1], before[1])
 
