@@ -3,11 +3,15 @@
 # ruff: noqa: E402  torch is optional
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 torch = pytest.importorskip("torch")
+from torch.nn import functional as F  # noqa: N812
 
-from tofcapture_model.config import Losses
+from tests.test_model_networks import TINY_COMPACT, frame
+from tofcapture_model.config import Losses, preset
 from tofcapture_model.frame import Estimate, Target
 from tofcapture_model.geometry.maps import unit, unproject
 from tofcapture_model.losses import (
@@ -20,6 +24,7 @@ from tofcapture_model.losses import (
     reweighted_smooth_l1,
 )
 from tofcapture_model.losses.chamfer import robust_chamfer
+from tofcapture_model.networks import build_model, training_loss
 
 SHAPE = (12, 16)
 K = torch.tensor([[20.0, 20.0, 7.5, 5.5]] * 2)
@@ -99,3 +104,23 @@ def test_masked_means_weigh_pixels():
     """A pixel of weight 1/4 counts a quarter in the sum and in the count; one of weight 0 may be NaN."""
     values, weight = torch.tensor([1.0, 3.0, float("nan")]), torch.tensor([1.0, 0.25, 0.0])
     assert masked_mean(values, weight).item() == pytest.approx((1 + 0.25 * 3) / (1 + 0.25))
+
+
+def test_an_image_counts_by_the_inverse_of_its_sensor_s_error_and_a_wrap_not_at_all():
+    """A camera that is ten times worse pulls no harder; a pixel that was unwrapped wrongly pulls at nothing."""
+    config = preset("compact")
+    model = build_model(replace(config, network=TINY_COMPACT, stages=config.stages))
+    data = frame(12, 16, batch=1)
+    data = data._replace(depth=torch.full_like(data.depth, 0.8), cues=torch.zeros_like(data.cues))
+    there = torch.ones(1, 1, 24, 32, dtype=torch.bool)
+    normals = torch.tensor([0.0, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, 24, 32)
+    truth = Target(there.float(), normals, there, ~there)
+    losses = replace(config.losses, normal=0.0, error=0.0)
+
+    def pull(shift):
+        seen = truth._replace(depth=F.interpolate(data.depth, scale_factor=2, mode="nearest") + shift)
+        return float(training_loss(model, losses, "joint", model(data), seen, data).total.detach())
+
+    assert pull(0.05) == pytest.approx(pull(0.2), rel=0.2)
+    assert pull(0.002) < 0.5 * pull(0.05)
+    assert pull(2.0) == 0
