@@ -45,7 +45,7 @@ FIT_RADII = (1, 2)  # px of the sensor, of the planes that compact fits to its o
 _HEAD_WIDTH = 24
 _HOLE = 1e-3  # weight of a filled pixel
 _PHASOR_FLOOR = 1e-4  # SIGNAL is 0.04; below it an amplitude is noise
-_LEAST_REACH, _NO_LIMIT = 0.006, 0.5  # m
+_LEAST_REACH, _NO_LIMIT = 0.001, 0.5  # m
 _ANYTHING = 6e4  # float16 holds it
 _TAIL, _MARGIN = (
     1e-3,
@@ -167,7 +167,7 @@ def _reach(frame: Frame, errors: Tensor, noise: Tensor) -> Tensor:
     ``errors`` (B, 4, H, W) and ``noise`` (B, 1, H, W) are in metres. Where nothing was measured there is no limit.
     """
     expected = errors[:, :3].abs().sum(1, keepdim=True)
-    limit = _LEAST_REACH + 4 * expected + frame.cues[:, 3:4].abs() + 4 * noise
+    limit = _LEAST_REACH + 0.7 * expected + 0.2 * frame.cues[:, 3:4].abs() + noise
     return torch.where(frame.valid > 0, limit, torch.full_like(limit, _NO_LIMIT))
 
 
