@@ -29,6 +29,7 @@ from tofcapture.ops.phase import taps
 from tofcapture.poses import look_at
 from tofcapture.rig import SPEED_OF_LIGHT, Rig
 from tofcapture_model.config import preset
+from tofcapture_model.evaluation.evaluate import VERSION as RESULTS_VERSION
 from tofcapture_model.networks import build_model
 from tofcapture_model.networks.checkpoint import save_model
 from tofcapture_model.report import write_report
@@ -118,7 +119,7 @@ def results_table(scene="ball", provenance=None):
 
     return {
         "format": "tofcapture-results",
-        "version": 1,
+        "version": RESULTS_VERSION,
         "dataset": "d",
         "split": "test",
         "scenes": [scene],

@@ -12,6 +12,7 @@ from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.files.manifest import Manifest, load_manifest, manifest_path
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Config
+from tofcapture_model.evaluation.evaluate import FORMAT, VERSION
 from tofcapture_model.networks import Model
 from tofcapture_model.networks.checkpoint import find_model, load_checkpoint, origin, sentence
 from tofcapture_model.training import read_metrics
@@ -63,9 +64,9 @@ def read_sources(
         raise ConfigError("nothing to report", hint="--dataset DIR --results results.json")
     if results is not None and not Path(results).is_file():
         raise DataError(f"{results}: no such file", hint="tofcapture evaluate DATASET --out results.json")
-    scores, no_results = _read_json(results, "tofcapture-results", ("methods", "split"), "--results")
+    scores, no_results = _read_json(results, (FORMAT, VERSION), ("methods", "split"), "--results")
     keys = ("pairs", "used", "views", "backend", "T_tof_stereo")
-    proof, no_evidence = _read_json(evidence, "tofcapture-evidence", keys, "--evidence")
+    proof, no_evidence = _read_json(evidence, ("tofcapture-evidence", 1), keys, "--evidence")
     network, no_weights = _read_network(weights)
     absent = {
         "dataset": "" if dataset else "not given, name it with --dataset",
@@ -80,7 +81,7 @@ def read_sources(
 
 
 def _read_json(
-    path: Path | None, kind: str, keys: tuple[str, ...], option: str
+    path: Path | None, kind: tuple[str, int], keys: tuple[str, ...], option: str
 ) -> tuple[dict[str, Any] | None, str]:
     """Read one of the project's JSON files; None and a reason where there is none."""
     if path is None:
@@ -91,8 +92,13 @@ def _read_json(
         table = json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as err:
         raise FormatError(f"{path}: not JSON: {err}") from err
-    if not isinstance(table, dict) or (table.get("format"), table.get("version")) != (kind, 1):
-        raise FormatError(f"{path}: expected {kind} version 1")
+    if not isinstance(table, dict) or (table.get("format"), table.get("version")) != kind:
+        got = (
+            f"{table.get('format')} version {table.get('version')}"
+            if isinstance(table, dict)
+            else "no object"
+        )
+        raise FormatError(f"{path}: expected {kind[0]} version {kind[1]}, got {got}", hint="write it again")
     missing = [k for k in keys if k not in table]
     if missing:
         raise FormatError(f"{path}: missing {', '.join(missing)}")
