@@ -35,7 +35,7 @@ FEATURES = f"""
 
 def aravis():
     """Load the library that Debian has, or skip."""
-    gi = pytest.importorskip("gi", reason="PyGObject is not installed: see docs/genicam.md")
+    gi = pytest.importorskip("gi", reason="PyGObject is not installed: see docs/devices.md")
     try:
         gi.require_version("Aravis", "0.8")
         from gi.repository import Aravis

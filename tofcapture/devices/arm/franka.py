@@ -1,4 +1,4 @@
-"""The driver ``franka``: a Franka Research 3 through ``franky-control``; see docs/franka.md.
+"""The driver ``franka``: a Franka Research 3 through ``franky-control``; see docs/devices.md.
 
 ::
 

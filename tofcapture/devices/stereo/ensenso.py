@@ -1,4 +1,4 @@
-"""The driver ``ensenso``: an Ensenso stereo camera through the ``nxlib`` package and the Ensenso SDK; see docs/ensenso.md.
+"""The driver ``ensenso``: an Ensenso stereo camera through the ``nxlib`` package and the Ensenso SDK; see docs/devices.md.
 
 ::
 
@@ -79,7 +79,7 @@ class Ensenso(ReopenedCamera, StereoDevice):
         """
         where = f"[stereo] {self._serial}"
         said = described(read_description(self._file), self._table, _DESCRIPTION, where)
-        return stereo_info({**said, "serial": self._serial}, where, "docs/ensenso.md")
+        return stereo_info({**said, "serial": self._serial}, where, "docs/devices.md")
 
     def capture(self) -> StereoFrame:
         """Take one point map.

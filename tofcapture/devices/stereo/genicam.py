@@ -1,4 +1,4 @@
-"""The driver ``genicam``: 3-D cameras of the GenICam standard, as Photoneo's and Basler's, through Aravis; see docs/genicam.md.
+"""The driver ``genicam``: 3-D cameras of the GenICam standard, as Photoneo's and Basler's, through Aravis; see docs/devices.md.
 
 ::
 
@@ -65,7 +65,7 @@ class GenICam(ReopenedCamera, StereoDevice):
         if not isinstance(table.get("device"), str):
             raise ConfigError(
                 f"[stereo] device: expected a camera's name or address, got {table.get('device')!r}",
-                hint="arv-tool-0.8 lists cameras; see docs/genicam.md",
+                hint="arv-tool-0.8 lists cameras; see docs/devices.md",
             )
         if wrong := [k for k in _FEATURES if not isinstance(table.get(k, {}), Mapping)]:
             raise ConfigError(f"[stereo] {wrong[0]}: expected a table of features")
@@ -78,7 +78,7 @@ class GenICam(ReopenedCamera, StereoDevice):
         """Say what this camera is, from ``station.toml`` and the description file; opens nothing."""
         where = f"[stereo] {self._name}"
         said = described(read_description(self._file), self._table, _DESCRIPTION, where)
-        return stereo_info({**said, "serial": said.get("serial", self._name)}, where, "docs/genicam.md")
+        return stereo_info({**said, "serial": said.get("serial", self._name)}, where, "docs/devices.md")
 
     def capture(self) -> StereoFrame:
         """Take one frame; the camera exposes for it alone, lit where ``lit`` and ``dark`` say how.
@@ -140,7 +140,7 @@ class GenICam(ReopenedCamera, StereoDevice):
         except (ImportError, ValueError) as err:
             raise ConfigError(
                 f"the driver genicam needs Aravis and PyGObject: {err}",
-                hint="apt-get install gir1.2-aravis-0.8 python3-gi; see docs/genicam.md",
+                hint="apt-get install gir1.2-aravis-0.8 python3-gi; see docs/devices.md",
             ) from err
         with _errors(self._name, "opening"):
             self._camera = _found(Aravis, self._name)

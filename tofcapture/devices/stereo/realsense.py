@@ -1,4 +1,4 @@
-"""The driver ``realsense``: a RealSense D4xx through ``pyrealsense2``; see docs/realsense.md.
+"""The driver ``realsense``: a RealSense D4xx through ``pyrealsense2``; see docs/devices.md.
 
 ::
 
@@ -72,7 +72,7 @@ class RealSense(ReopenedCamera, StereoDevice):
         """
         where = f"[stereo] {self._serial}"
         said = described(read_description(self._file), self._table, _DESCRIPTION, where)
-        return stereo_info({**said, "serial": self._serial}, where, "docs/realsense.md")
+        return stereo_info({**said, "serial": self._serial}, where, "docs/devices.md")
 
     def capture(self) -> StereoFrame:
         """Light the projector, take one depth image, put the projector out.

@@ -1,4 +1,4 @@
-"""The driver ``arducam``: Arducam ToF modules over V4L2, without the vendor's package; see docs/arducam.md.
+"""The driver ``arducam``: Arducam ToF modules over V4L2, without the vendor's package; see docs/devices.md.
 
 ::
 
@@ -30,7 +30,7 @@ from tofcapture.files.camera_bytes import ARDUCAM
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
 
-_PAGE = "docs/arducam.md"
+_PAGE = "docs/devices.md"
 
 
 class ArducamTof(V4l2Tof):

@@ -1,4 +1,4 @@
-"""The driver ``espros``: a TOFcam-660 (epc660) through ESPROS's own client, ``epc-tofcam-toolkit``; see docs/espros.md.
+"""The driver ``espros``: a TOFcam-660 (epc660) through ESPROS's own client, ``epc-tofcam-toolkit``; see docs/devices.md.
 
 ::
 
@@ -46,7 +46,7 @@ _PHASES = (0.0, 1.5 * np.pi, np.pi, 0.5 * np.pi)  # the client: phi = atan2(dcs1
 _MIDDLE, _FLAGS = 2048, 64000  # the client subtracts the first from all but flags
 _CONNECT = 3.0  # s
 _ANSWER = 1.0  # s, of a command; the client asks five times
-_PAGE = "see docs/espros.md"
+_PAGE = "see docs/devices.md"
 
 
 class Espros(ReopenedCamera, TofCamera):

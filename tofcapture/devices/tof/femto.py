@@ -1,4 +1,4 @@
-"""The driver ``femto``: raw phases of an Orbbec Femto Bolt, a camera of the Azure Kinect's class, over UVC; see docs/femto.md.
+"""The driver ``femto``: raw phases of an Orbbec Femto Bolt, a camera of the Azure Kinect's class, over UVC; see docs/devices.md.
 
 ::
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _MHZ = [196.75, 191.57, 53.57]  # as others fitted them; a camera's headers say their own
 _PHASES = 3
 _CLOCK = 6e3  # Hz; headers tell multiples of 10 kHz
-_PAGE = "docs/femto.md"
+_PAGE = "docs/devices.md"
 
 
 class FemtoTof(V4l2Tof):
