@@ -83,7 +83,8 @@ def test_measurements_of_a_seed():
     world.set_pose(look_at([0.3, 0.2, 0.3], [0.7, 0.0, -0.4]), b"pose")
     light = world.light()
     sums = [checksum(part) for part in (light.phasor.real, light.phasor.imag, light.steady)]
-    assert sums == pytest.approx([-0.13307733, 0.07112404, -0.03828060], abs=3e-4)
+    # rays are cast by what vector units the processor has: at a rim one more or less meets the mug
+    assert sums == pytest.approx([-0.13307733, 0.07112404, -0.03828060], abs=3e-3)
     assert light.steady.mean() == pytest.approx(0.37338298, rel=1e-4)
     assert np.abs(light.phasor).mean(axis=(1, 2)) == pytest.approx([0.34554366, 0.34548458], rel=1e-4)
     points = world.stereo(lambda: 0).points
