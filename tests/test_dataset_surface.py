@@ -132,6 +132,7 @@ def test_all_views_see_more_than_one(views, fused, single):
     assert 0.5 < (sure < 1).mean() < 0.95
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_bytes(recording, fused, tmp_path):
     """Whoever measures which view, and fuses which."""
     again = build_dataset([recording], tmp_path / "dataset", jobs=2, config=FUSED)
@@ -139,6 +140,7 @@ def test_two_processes_give_the_same_bytes(recording, fused, tmp_path):
     assert build_dataset([recording], tmp_path / "dataset", jobs=2, config=FUSED).skipped == ("mug",)
 
 
+@pytest.mark.slow
 def test_a_view_with_a_wrong_pose_is_named_and_kept_apart(views, single, tmp_path, capsys):
     """It is 40 mm from where it says: its truth is its own, and no other view's is made of it."""
     wrong = said(views[2], views[2].arm_before.T_base_flange @ exp([0.03, 0.03, 0, 0, 0, 0.1]))

@@ -142,12 +142,9 @@ def test_chunks_are_what_a_training_read_touches(tmp_path):
     with h5py.File(path, "r") as file:
         assert file["tof/raw"].chunks == (1, 1, 8, 6, 8)
         assert file["gt/normals_2x"].chunks == (1, 12, 16, 3)
-        here = [
-            f for f in SHARD if f.path in file
-        ]  # what all views together saw is there where it was asked for
-        assert len(here) >= 20
-        assert all(file[f.path].fletcher32 for f in here if f.chunk)
-        assert all(file[f.path].attrs["units"] == f.units for f in here)
+        there = [f for f in SHARD if not f.path.startswith("fused/")]  # of views built one by one
+        assert all(file[f.path].fletcher32 for f in there if f.chunk)
+        assert all(file[f.path].attrs["units"] == f.units for f in there)
 
 
 @pytest.mark.parametrize("filters", ["as written", "others", "another burst"])
