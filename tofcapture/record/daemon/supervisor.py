@@ -13,6 +13,7 @@ import traceback
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, Self
 
 from tofcapture import __version__
@@ -159,6 +160,13 @@ class Progress:
     def table(self) -> dict[str, Any]:
         """List all views as JSON types."""
         return {"job": self.job, "views": [self.views[i] for i in sorted(self.views)]}
+
+
+def _made(folder: Path) -> int | None:
+    """Make a recording's folder where it can be, else the recorder will say why not; its inode."""
+    with contextlib.suppress(OSError):
+        folder.mkdir(exist_ok=True)
+    return inode_of(folder)
 
 
 class Supervisor:
@@ -329,9 +337,12 @@ class Supervisor:
 
     async def _note(self, number: int, state: str, reason: str = "") -> None:
         """Put a job into another state, however long another process holds the database."""
+        await self._patiently(lambda: self.store.move(number, state, reason))
+
+    async def _patiently(self, store: Callable[[], None]) -> None:
         while True:
             try:
-                self.store.move(number, state, reason)
+                store()
             except BusyError:
                 if self._closing:
                     return  # it is left as running, which the next daemon puts back
@@ -381,6 +392,10 @@ class Supervisor:
         if trouble := await self._folder_trouble(job):
             return {"kind": "error", "own": False, "message": trouble, "cause": "FolderGone"}
         settings = self.settings
+        if job.recording not in self._held:  # made and known before the recorder may die in it
+            self._hold({job.recording: await asyncio.to_thread(_made, settings.root / job.recording)})
+        known = {name: self._held[name] for name in ("", job.recording) if name in self._held}
+        await self._patiently(lambda: self.store.hold_folders(known))
         told = {
             **asdict(job),
             "recording": str(settings.root / job.recording),
@@ -388,11 +403,7 @@ class Supervisor:
             "allow_motion": settings.allow_motion,
             "previews": str(settings.state.previews),
             # a folder may go while the recorder starts: it looks again, right before it writes
-            "folders": {
-                str(settings.root / name): self._held[name]
-                for name in ("", job.recording)
-                if name in self._held
-            },
+            "folders": {str(settings.root / name): inode for name, inode in known.items()},
         }
         self._recorder = await RecorderProcess.start(told, settings)
         if self.reason:
@@ -405,7 +416,7 @@ class Supervisor:
                 if message["kind"] in _ENDS:
                     last = message
                 else:
-                    self._hear(message, job.recording)
+                    self._hear(message)
         finally:
             if not last:
                 self._recorder.kill()
@@ -413,12 +424,10 @@ class Supervisor:
             self._recorder = None
         return last
 
-    def _hear(self, message: dict[str, Any], recording: str) -> None:
+    def _hear(self, message: dict[str, Any]) -> None:
         self.progress.hear(message)
         kind = message.pop("kind")
         self.counters[kind] += 1
-        if kind == "planned":
-            self._hold({recording: inode_of(self.settings.root / recording)})
         if kind == "sealed":
             message["preview"] = self.counters["sealed"]
         self._say(kind, job=self.progress.job, progress=self.progress.counts(), **message)
