@@ -101,7 +101,9 @@ def test_recording_completes_after_a_protective_stop(emulator, tmp_path, monkeyp
         result = record(station, "mug", recording, views=1, frames=1)
     assert result.failed == ()
     view = open_view(view_path(recording, "mug", 0))
-    np.testing.assert_allclose(view.arm_before.joints, result.plan.views[0].joints, atol=4e-4)
+    planned = result.plan.views[0]
+    places = [p.joints for p in (planned, planned.spare) if p is not None]
+    assert min(np.abs(view.arm_before.joints - joints).max() for joints in places) < 4e-4
     assert view.truth.target.any()
 
 
@@ -161,7 +163,7 @@ def test_a_controller_that_denies_every_pose_is_no_check(emulator, tmp_path, cap
         with pytest.raises(MotionRefused, match="controller's safety limits"):
             station.arm.check_move(HOME, HOME + 0.02)
         with pytest.raises(MotionRefused, match="controller's safety limits"):
-            station.arm.move_to(station.arm.state().joints + 0.02)
+            station.arm.move_to(station.arm.state().joints - 0.02)  # back, where nothing is in the way
 
 
 @pytest.mark.parametrize(("model", "seed"), [("ur10e", 0), pytest.param("ur5e", 1, marks=pytest.mark.slow)])
