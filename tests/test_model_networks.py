@@ -149,9 +149,9 @@ def test_the_residual_is_bounded_where_asked():
     data = frame()
     data = data._replace(depth=torch.full_like(data.depth, 0.8), cues=torch.zeros_like(data.cues))
     torch.testing.assert_close(
-        model(data).depth, torch.full((2, 1, 72, 88), 0.806)
+        model(data).depth, torch.full((2, 1, 72, 88), 0.801)
     )  # nothing says it is wrong
-    data.cues[:, 0] = 0.01
+    data.cues[:, 0] = 0.1
     torch.testing.assert_close(model(data).depth, torch.full((2, 1, 72, 88), 0.82))
     data.valid[:] = 0  # what was not measured may be anywhere
     assert (model(data).depth > 1.2).all()
