@@ -127,6 +127,7 @@ def test_patterns_are_opencvs():
         assert (ours.dark(xy).reshape(drawn.shape) != drawn).mean() < 0.01
 
 
+@pytest.mark.slow
 def test_lens_of_a_folder_of_images(tmp_path):
     """Images through a known lens give it back within three sigma, and say their verdict."""
     board = load_board("charuco")

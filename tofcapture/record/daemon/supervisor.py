@@ -339,7 +339,7 @@ class Supervisor:
         """Put a job into another state, however long another process holds the database."""
         await self._patiently(lambda: self.store.move(number, state, reason))
 
-    async def _patiently(self, store: Callable[[], None]) -> None:
+    async def _patiently(self, store: Callable[[], object]) -> None:
         while True:
             try:
                 store()
