@@ -5,16 +5,8 @@ import numpy as np
 from tofcapture.devices.kinematics import HOME
 
 THERE = HOME - [1.2, 0, 0, 0, 0, 0]
-# A UR arm, fast and hardly settling, and simulated cameras of few pixels that follow it.
-STATION = """
-[arm]
-driver = "ur_rtde"
-host = "{host}"
-speed = 1.0
-camera_speed = 1.5
-acceleration = 1.4
-settle = 0.05
-{more}
+# Simulated cameras of few pixels.
+CAMERAS = """
 [tof]
 driver = "sim"
 [stereo]
@@ -38,12 +30,26 @@ fx = 60.0
 fy = 60.0
 cx = 31.5
 cy = 24.5
+"""
+# A UR arm, fast and hardly settling, and the cameras that follow it.
+STATION = (
+    CAMERAS
+    + """
+[arm]
+driver = "ur_rtde"
+host = "{host}"
+speed = 1.0
+camera_speed = 1.5
+acceleration = 1.4
+settle = 0.05
+{more}
 [plan]
 table = -0.50
 target = [0.70, 0.0, -0.44]
 board = [0.70, 0.0, -0.22]
 board_normal = [-0.258819, 0.0, 0.965926]
 """
+)
 
 
 def station_file(tmp_path, emulator, more=""):

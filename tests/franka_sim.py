@@ -17,8 +17,12 @@ import time
 
 import numpy as np
 
+from tests.emulated import CAMERAS
+
 # The simulator has a floor at the height of the base: the table stands on it.
-STATION = """
+STATION = (
+    CAMERAS
+    + """
 [arm]
 driver = "franka"
 host = "{host}"
@@ -27,29 +31,6 @@ speed = 1.0
 camera_speed = 1.5
 acceleration = 1.4
 settle = 0.05
-[tof]
-driver = "sim"
-[stereo]
-driver = "sim"
-[operator]
-driver = "sim"
-[sim.render]
-multipath = false
-subpixels = 1
-[sim.tof]
-width = 24
-height = 18
-fx = 19.0
-fy = 20.0
-cx = 11.7
-cy = 10.1
-[sim.stereo]
-width = 64
-height = 50
-fx = 60.0
-fy = 60.0
-cx = 31.5
-cy = 24.5
 [plan]
 table = 0.05
 target = [0.50, 0.0, 0.13]
@@ -59,6 +40,7 @@ keep_out_radius = 0.15
 keep_out_height = 0.20
 home = [0.0, -0.785398, 0.0, -2.356194, 0.0, 1.570796, 0.785398]
 """
+)
 _GAINS = {
     "kp": (2000.0, 2000.0, 1500.0, 1500.0, 400.0, 400.0, 100.0),
     "kv": (200.0, 200.0, 150.0, 150.0, 20.0, 20.0, 5.0),

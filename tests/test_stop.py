@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests import until
-from tests.emulated import station_file
+from tests.emulated import CAMERAS, station_file
 from tests.stopping import LAYERS, faults_of, sweep
 from tofcapture.devices import Arm
 from tofcapture.devices.faults import StopLatch
@@ -175,40 +175,20 @@ class _StopAt(Observer):
         self._note()
 
 
-SMALL = """
+SMALL = (
+    CAMERAS
+    + """
 [arm]
-driver = "sim"
-[tof]
-driver = "sim"
-[stereo]
-driver = "sim"
-[operator]
 driver = "sim"
 [plan]
 table = -0.50
 target = [0.70, 0.0, -0.44]
 board = [0.70, 0.0, -0.22]
 board_normal = [-0.258819, 0.0, 0.965926]
-[sim.render]
-multipath = false
-subpixels = 1
-[sim.tof]
-width = 24
-height = 18
-fx = 19.0
-fy = 20.0
-cx = 11.7
-cy = 10.1
-[sim.stereo]
-width = 64
-height = 50
-fx = 60.0
-fy = 60.0
-cx = 31.5
-cy = 24.5
 [sim.faults]
 stereo_empty = [0]
 """
+)
 
 
 @pytest.mark.parametrize(("scene", "moments"), [("mug", range(20)), ("calibration", (0, 1, 4, 7))])

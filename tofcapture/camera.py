@@ -229,6 +229,17 @@ class Camera:
             v = self.fy * points[..., 1] / safe + self.cy
         return np.stack([u, v], axis=-1), z
 
+    def nearest(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Project points (N, 3), camera frame, metres, to the depth (H, W) of the nearest in each pixel; NaN where there is none."""
+        points = points[np.isfinite(points).all(axis=-1) & (points[:, 2] > 1e-3)]
+        out = np.full(self.shape, np.inf)
+        u, v = np.moveaxis(self.project(points)[0], -1, 0)
+        inside = (u > -0.5) & (u < self.width - 0.5) & (v > -0.5) & (v < self.height - 0.5)
+        np.minimum.at(
+            out, (np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)), points[inside, 2]
+        )
+        return np.where(np.isfinite(out), out, np.nan).astype(np.float32)
+
     def _through_lens(self, xy: Float64) -> Float64:
         near = np.square(xy).sum(axis=-1) < self._reach
         xy = np.where(near[..., None], xy, np.nan)

@@ -11,7 +11,6 @@ from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.errors import DataError
 from tofcapture.frames import NO_TRUTH, View
 from tofcapture.importing.rules import Float32, sign_unknown
-from tofcapture.importing.truth import nearest
 from tofcapture.ops.phase import Decoder
 from tofcapture.poses import Float64, transform_points
 
@@ -73,7 +72,7 @@ def compare(view: View, where: str, model: str, *, placed: bool = True) -> Overl
 
 def seen(view: View, T: Float64) -> Float32:
     """Project the point map into the ToF image (H, W) by ``T``."""
-    return nearest(transform_points(T, view.stereo.points.reshape(-1, 3)), view.tof.info.camera)
+    return view.tof.info.camera.nearest(transform_points(T, view.stereo.points.reshape(-1, 3)))
 
 
 def _better(tof: Float32, truth: Float32, view: View, off: float) -> str:

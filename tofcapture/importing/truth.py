@@ -200,7 +200,7 @@ def _of_surface(values: NDArray[Any], view: Planned, said: Said, pinhole: Camera
         )
     points = transform_points(T, values * scale)
     camera = pinhole.scaled(2) if values.ndim == 3 else pinhole
-    depth = _cast(points, camera) if values.ndim == 3 else nearest(points, camera)
+    depth = _cast(points, camera) if values.ndim == 3 else camera.nearest(points)
     lifted = (depth[..., None] * camera.rays).astype(np.float32)
     return PointMap(lifted, camera, np.eye(4), "imported mesh" if values.ndim == 3 else "imported cloud")
 
@@ -215,16 +215,6 @@ def _cast(triangles: Float64, camera: Camera) -> Float32:
     rays = np.concatenate([np.zeros_like(camera.rays), camera.rays], axis=-1).astype(np.float32)
     found: Float32 = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()
     return np.where(np.isfinite(found), found, np.float32(np.nan))
-
-
-def nearest(points: Float64, camera: Camera) -> Float32:
-    """Project points (N, 3), camera frame, to the depth (H, W) of the nearest in each pixel; NaN where there is none."""
-    points = points[np.isfinite(points).all(axis=-1) & (points[:, 2] > 1e-3)]
-    out = np.full(camera.shape, np.inf)
-    u, v = np.moveaxis(camera.project(points)[0], -1, 0)
-    inside = (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
-    np.minimum.at(out, (np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)), points[inside, 2])
-    return np.where(np.isfinite(out), out, np.nan).astype(np.float32)
 
 
 def pinhole_of(points: NDArray[np.float32], where: str) -> Camera:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from tofcapture.camera import Camera
 from tofcapture.devices.clearance import COLUMN, WRIST, Workcell, body_of, segment_gap
 from tofcapture.devices.kinematics import ArmModel, forward
-from tofcapture.importing.truth import nearest
 from tofcapture.ops.crop import SAMPLE, crop_depth, find_crop
 from tofcapture.ops.project import STEEPEST
 from tofcapture.poses import Float64, invert_all
@@ -175,7 +174,7 @@ def covered(depth: NDArray[np.float32], points: Float64, camera: Camera, T_base_
     crop = find_crop(some, T_base_tof[2, :3], np.random.default_rng(0))
     if not np.isfinite(crop.offset):
         return float("nan")
-    seen = nearest(points, camera)
+    seen = camera.nearest(points)
     there = np.isfinite(seen)
 
     def stands(image: NDArray[np.float32], clear: float) -> Bools:

@@ -21,9 +21,7 @@ from tofcapture_model.geometry.maps import (
     thin_intrinsics,
 )
 
-SIGNAL = (
-    0.04  # amplitude of a white surface that faces the sensor at 1 m, to which every camera's light is scaled
-)
+SIGNAL = 0.04  # of a white surface that faces the sensor at 1 m: what every camera's light is scaled to
 STEP = 10  # pixels per patch
 BOUNCES = 3  # the fourth adds less than the first lacks in knowledge
 _WHITEST = 0.9  # albedo
@@ -31,10 +29,7 @@ _FAR = 3.0  # m
 _GRAZING = 0.15  # cosine below which the direct light of a patch says nothing
 _FAINT = 1e-3  # below it an amplitude is noise
 _TINY = 1e-12
-_PALE, _PALENESS = (
-    0.9,
-    0.5,
-)  # quantile of brightness that is taken for pale, and the albedo of that on average
+_PALE, _PALENESS = 0.9, 0.5  # quantile of brightness that is taken for pale, and its albedo on average
 
 
 def light(phasor: Tensor, depth: Tensor, valid: Tensor, intrinsics: Tensor) -> Tensor:

@@ -88,21 +88,21 @@ def training_loss(
     if isinstance(model, Baseline):
         loss = model.loss(estimate, target, frame)
         return Objective(loss, {"depth": loss}, torch.zeros(7))
-    target, fine = _unwrapped(target, frame), scale_intrinsics(frame.intrinsics, 2)
-    return objective(weights, stage, estimate, target, fine, _share(target, frame, weights.delta))
+    target, share = _weighed(target, frame, weights.delta)
+    return objective(weights, stage, estimate, target, scale_intrinsics(frame.intrinsics, 2), share)
 
 
-def _share(target: Target, frame: Frame, delta: float) -> Tensor:
-    """Let an image (B, 1, 1, 1) count by the inverse of its sensor's error: a camera of centimetres must not outweigh ten of millimetres."""
-    decoded = F.interpolate(frame.depth, scale_factor=2, mode="nearest")
-    good = target.good.float()
-    wrong = ((decoded - target.depth).abs().clamp_max(_WRAPPED) * good).sum((1, 2, 3), keepdim=True)
-    return 1 / (wrong / good.sum((1, 2, 3), keepdim=True).clamp_min(1) / delta).clamp_min(1)
+def _weighed(target: Target, frame: Frame, delta: float) -> tuple[Target, Tensor]:
+    """Leave out what was measured a wrap away, and let an image count by the inverse of its sensor's error, (B, 1, 1, 1).
 
-
-def _unwrapped(target: Target, frame: Frame) -> Target:
-    """Leave out what was measured a wrap away: no network moves a depth so far, and one such pixel outweighs hundreds."""
-    decoded = F.interpolate(frame.depth, scale_factor=2, mode="nearest")
-    valid = F.interpolate(frame.valid, scale_factor=2, mode="nearest") > 0
-    near = ~valid | ((decoded - target.depth).abs() < _WRAPPED)
-    return target._replace(good=target.good & near, context=target.context & near)
+    No network moves a depth by a wrap, and one such pixel outweighs hundreds. A camera of centimetres must not outweigh ten of
+    millimetres.
+    """
+    decoded, valid = (F.interpolate(x, scale_factor=2, mode="nearest") for x in (frame.depth, frame.valid))
+    wrong = (decoded - target.depth).abs()
+    near = (valid == 0) | (wrong < _WRAPPED)
+    good = target.good & near
+    mean = (wrong.clamp_max(_WRAPPED) * good).sum((1, 2, 3), keepdim=True) / good.sum(
+        (1, 2, 3), keepdim=True
+    ).clamp_min(1)
+    return target._replace(good=good, context=target.context & near), 1 / (mean / delta).clamp_min(1)

@@ -47,10 +47,8 @@ _HOLE = 1e-3  # weight of a filled pixel
 _PHASOR_FLOOR = 1e-4  # SIGNAL is 0.04; below it an amplitude is noise
 _LEAST_REACH, _NO_LIMIT = 0.001, 0.5  # m
 _ANYTHING = 6e4  # float16 holds it
-_TAIL, _MARGIN = (
-    1e-3,
-    0.25,
-)  # of a channel's values that count as strange in training; of its range that is allowed beyond
+_TAIL = 1e-3  # of a channel's values that count as strange in training
+_MARGIN = 0.25  # of its range that is allowed beyond
 _MIN_ERROR = 1e-3  # m; the same floor as in eq. 1
 _GAIN_UNIT = 5.0  # gains learn at the pace of the weights of a layer, which move by much less than 1
 

@@ -393,7 +393,8 @@ class Supervisor:
             return {"kind": "error", "own": False, "message": trouble, "cause": "FolderGone"}
         settings = self.settings
         if job.recording not in self._held:  # made and known before the recorder may die in it
-            self._hold({job.recording: await asyncio.to_thread(_made, settings.root / job.recording)})
+            inode = await asyncio.to_thread(_made, settings.root / job.recording)
+            self._held |= {} if inode is None else {job.recording: inode}
         known = {name: self._held[name] for name in ("", job.recording) if name in self._held}
         await self._patiently(lambda: self.store.hold_folders(known))
         told = {
