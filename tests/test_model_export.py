@@ -113,6 +113,17 @@ def test_the_backend_refuses_frames_of_another_size(run):
                 rig=_rig_of(run, replace(SMALL, width=50)), backend="onnx")  # fmt: skip
 
 
+def test_an_export_answers_for_cameras_of_three_frequencies(exported):
+    """It reads the lowest and the highest, as the network does, however many there are between."""
+    frame = exporting.example(1, SIZE)._replace(modulation=torch.tensor([[54e6, 198e6, 189e6]]))
+    model, config, _ = load_checkpoint(exported)
+    with torch.no_grad():
+        expected = model(frame).depth
+    found = exporting.ask_onnx(exporting.open_onnx(exported.with_suffix(".onnx")), frame)[0]
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    assert config.network.kind == "compact"
+
+
 def _rig_of(folder, camera):
     from tofcapture.camera import Camera
     from tofcapture.rig import Rig, dumps_rig

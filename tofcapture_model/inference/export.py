@@ -245,7 +245,8 @@ def ask_onnx(session: Any, frame: Frame) -> list[NDArray[np.float32]]:
             f"expected an export for cameras with such a lens, got one that takes {numbers - PINHOLE} of its coefficients",
             hint="run tofcapture export again: it takes any lens now",
         )
-    asked = frame._replace(intrinsics=with_lens(frame.intrinsics)[:, :numbers])
+    ends = frame.modulation[:, :2]  # the lowest and the highest: no network reads others
+    asked = frame._replace(intrinsics=with_lens(frame.intrinsics)[:, :numbers], modulation=ends)
     feed = {k: np.ascontiguousarray(v.numpy()) for k, v in asked._asdict().items() if k in wanted}
     found: list[NDArray[np.float32]] = session.run(list(OUTPUTS), feed)
     return found
