@@ -49,6 +49,8 @@ _LEAST_REACH, _NO_LIMIT = 0.001, 0.5  # m
 _ANYTHING = 6e4  # float16 holds it
 _TAIL = 1e-3  # of a channel's values that count as strange in training
 _MARGIN = 0.25  # of its range that is allowed beyond
+_SOFT, _LEAST_SOFT = 0.1, 0.05  # of its range, and of the unit: from there on beyond, a channel is all strange
+_WHERE = slice(13, 16)  # channels that tell where a pixel is and whether it was measured: training on crops never sees all of them
 _MIN_ERROR = 1e-3  # m; the same floor as in eq. 1
 _GAIN_UNIT = 5.0  # gains learn at the pace of the weights of a layer, which move by much less than 1
 
@@ -96,6 +98,10 @@ class CompactInputs(nn.Module):
         ends = torch.tensor([-_ANYTHING, _ANYTHING])
         self.register_buffer("familiar", ends[:, None].repeat(1, self.channels))
         self.familiar: Tensor  #: (2, C) least and largest value of each channel in training
+        judged = torch.ones(1, self.channels, 1, 1)
+        judged[:, _WHERE] = 0
+        self.register_buffer("judged", judged, persistent=False)
+        self.judged: Tensor
 
     def remember(self, images: Iterable[Tensor]) -> None:
         """Take the range of each channel over images (B, C, H, W) that were learned from, and what was taken before."""
@@ -137,11 +143,15 @@ class CompactInputs(nn.Module):
         return Features(image, candidates, reach, self._trust(image), normals[len(normals) // 2], r)
 
     def _trust(self, image: Tensor) -> Tensor:
-        """Tell where every channel is within what was learned from, (B, 1, H, W); a few strangers are noise."""
+        """Tell where every channel is within what was learned from, (B, 1, H, W); a few strangers are noise.
+
+        It fades beyond the bounds: at a step, the rounding of a backend would decide.
+        """
         if self.training:
             return torch.ones_like(image[:, :1])
         low, high = self.familiar[:, None, :, None, None]
-        strange = ((image < low) | (image > high)).any(1, keepdim=True).to(image)
+        beyond = torch.maximum(low - image, image - high) / (_SOFT * (high - low) + _LEAST_SOFT)
+        strange = (self.judged * beyond).clamp(0, 1).amax(1, keepdim=True)
         near = F.avg_pool2d(strange, 5, 1, 2, count_include_pad=False)
         return 1 - (4 * near).clamp_max(1.0)
 
