@@ -398,11 +398,12 @@ def _make(spec: ShiftSpec, out: Path, index: int) -> None:
 
 
 def _plan_once(plan: Callable[..., Any]) -> Callable[..., Any]:
-    """Look from the same places whatever the optics."""
+    """Look from the same places whatever the optics, in the order of the views' numbers: light is kept by them."""
 
     def planned(*given: Any) -> Any:
         if "plan" not in _World.common:
-            _World.common["plan"] = plan(*given)
+            found = plan(*given)
+            _World.common["plan"] = replace(found, views=tuple(sorted(found.views, key=lambda v: v.index)))
         return _World.common["plan"]
 
     return planned

@@ -258,6 +258,7 @@ CLOCKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", CLOCKS)
 def test_time_offset_is_found(clock):
     """Clocks of any unit and origin, with stray stamps or a step, are brought together to a millisecond, and what they had is said."""

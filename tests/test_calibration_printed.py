@@ -67,7 +67,7 @@ def test_small_images_give_corners_to_hundredths_of_a_pixel(name, roll):
     assert np.linalg.norm(seen.fit.T[:3, 3] - T[:3, 3]) < 0.003
 
 
-@pytest.mark.parametrize("roll", [4, 184])
+@pytest.mark.parametrize("roll", [4, pytest.param(184, marks=pytest.mark.slow)])
 def test_large_images_of_tags_hold_no_stray_corner(roll):
     """Corners of tags do not jump to the squares between them, upright and upside down."""
     board, camera = load_board("aprilgrid"), Camera(960, 720, 760.0, 765.0, 478.0, 361.0, LENS.distortion)

@@ -529,7 +529,10 @@ def test_openapi_is_what_is_served(daemon):
     assert stored["components"]["schemas"]["Job"]["properties"].keys() == known
 
 
-@pytest.mark.parametrize("fault", ["closed", "unexpected", "millimetres"])
+@pytest.mark.parametrize(
+    "fault",
+    ["closed", *(pytest.param(f, marks=pytest.mark.slow) for f in ("unexpected", "millimetres"))],
+)
 def test_the_queue_does_not_burn(tmp_path, fault):
     """What the next job would meet as well puts the job back and rests; with the cause gone all jobs are done."""
     (tmp_path / "fault").write_text(fault)

@@ -204,15 +204,15 @@ def test_simulated_views_of_other_poses_are_fine(tmp_path):
 
 
 def test_random_damage_is_reported_and_never_read(tmp_path):
-    """Sixty random corruptions: check reports each, readers raise named errors or give what was stored."""
+    """Thirty random corruptions: check reports each, readers raise named errors or give what was stored."""
     script = Path(__file__).parents[1] / "benchmarks/mutations.py"
     done = subprocess.run(
-        [sys.executable, str(script), "--count", "60", "--seed", "1", "--json"],
+        [sys.executable, str(script), "--count", "30", "--seed", "1", "--json"],
         capture_output=True,
         text=True,
         check=True,
     )
     result = json.loads(done.stdout)
-    assert (result["corruptions"], result["reported"]) == (60, 60)
+    assert (result["corruptions"], result["reported"]) == (30, 30)
     assert set(result["reads"]) == {"right", "named error"}, result
-    assert result["reads"]["named error"] > 40
+    assert result["reads"]["named error"] > 20

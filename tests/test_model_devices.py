@@ -32,6 +32,7 @@ def dataset(tmp_path_factory):
     return make_dataset(tmp_path_factory.mktemp("data") / "dataset", scale=4)
 
 
+@pytest.mark.slow
 def test_nothing_stays_on_the_host(tmp_path):
     """Training with validation, evaluation and a suite on a device that refuses to mix its tensors with the host's."""
     dataset = make_dataset(tmp_path / "data", views=1, frames=1, scale=4)
@@ -47,6 +48,7 @@ def test_nothing_stays_on_the_host(tmp_path):
     assert done.stdout.endswith("all on one device\n"), done.stderr[-3000:]
 
 
+@pytest.mark.slow
 def test_the_second_device_refuses_the_host_s_tensors():
     """The check of the test above: a sum of both is an error there, too."""
     code = (

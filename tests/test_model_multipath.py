@@ -11,7 +11,15 @@ torch = pytest.importorskip("torch")
 
 from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.geometry.maps import rays, thin_intrinsics
-from tofcapture_model.geometry.multipath import SIGNAL, cues, exchange_error, halo_error, patches, surface
+from tofcapture_model.geometry.multipath import (
+    SIGNAL,
+    cues,
+    exchange_error,
+    halo_error,
+    light,
+    patches,
+    surface,
+)
 
 K = torch.tensor([[90.0, 90.0, 59.5, 44.5]])
 SHAPE = (90, 120)
@@ -96,3 +104,14 @@ def test_cues_are_five_finite_maps_even_of_noise():
     found = cues(noise, depth, valid, 10 * torch.randn(1, 1, *SHAPE, generator=g), K, (2e7, HZ))
     assert found.shape == (1, 5, *SHAPE)
     assert torch.isfinite(found).all()
+
+
+def test_a_black_room_is_not_taken_for_a_strong_lamp():
+    """With all but a twentieth of the image black, the lamp is found within a factor of two, not eight times too weak."""
+    depth = torch.full((1, 1, *SHAPE), 0.8)
+    amplitude = SIGNAL / (depth * rays(K, *SHAPE).norm(dim=1, keepdim=True)).square()
+    room = torch.full_like(depth, 0.05)
+    room[..., : SHAPE[1] // 20] = 0.8
+    phasor = torch.cat([amplitude * room, torch.zeros_like(depth)] * 2, dim=1)
+    found = light(phasor, depth, torch.ones_like(depth), K)
+    assert 0.5 < found[0, 0] / SIGNAL < 2

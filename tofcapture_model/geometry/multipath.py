@@ -29,6 +29,7 @@ _FAR = 3.0  # m
 _GRAZING = 0.15  # cosine below which the direct light of a patch says nothing
 _FAINT = 1e-3  # below it an amplitude is noise
 _TINY = 1e-12
+_BRIGHT = 0.98  # quantile of brightness that a few mirrors do not reach
 _PALE, _PALENESS = 0.9, 0.5  # quantile of brightness that is taken for pale, and its albedo on average
 
 
@@ -46,6 +47,8 @@ def light(phasor: Tensor, depth: Tensor, valid: Tensor, intrinsics: Tensor) -> T
     square = (ray * depth[:, 0].square())[:, ::3, ::3].flatten(1)
     seen = (valid[:, 0, ::3, ::3].flatten(1) > 0) & (low > 0) & (high > 0)
     white = _quantile(high * square, seen, _PALE) / _PALENESS
+    # in a black room nine tenths are black; nothing is whiter than white
+    white = torch.maximum(white, _quantile(high * square, seen, _BRIGHT) / _WHITEST)
     ratio = _quantile((low.clamp_min(_TINY) / high.clamp_min(_TINY)).log(), seen, 0.5).exp()
     found = torch.stack([white * ratio, white], dim=1)
     return torch.where(found > 0, found, torch.full_like(found, SIGNAL)).clamp(1e-4, 1e2)
