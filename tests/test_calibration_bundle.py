@@ -112,6 +112,10 @@ def test_a_loose_camera_is_noticed():
     data = bundle_report(
         bundle, fits, Rig(camera, camera, true, X_TOF @ poses.exp([0.001, 0, 0, 0, 0, 0.01]))
     )
+    one_more = [replace(f, camera="tof") if k < 2 else f for k, f in enumerate(fits)]
+    half = len(fits) // 2
+    counted = bundle_report(bundle, one_more, Rig(camera, camera, true, X_TOF))["fits"]
+    assert counted == {"tof": half + 1, "stereo": half - 1}
     answers.hold(
         "bundle", {"data": data, "text": bundle_table({**data, "refused": ["view-003 tof: no board"]})}
     )

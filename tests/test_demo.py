@@ -3,6 +3,7 @@
 import json
 import struct
 import subprocess
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -107,6 +108,8 @@ def test_weights_are_described_without_the_libraries_that_run_them(tmp_path):
     """Kind and count come from the header; a file that is cut short, or another, is refused."""
     found = describe_weights(checkpoint(tmp_path / "model.safetensors"))
     assert (found.kind, found.weights, found.size) == ("compact", 6, found.path.stat().st_size)
+    of_millions = replace(found, weights=1_250_000, size=2_500_000)
+    assert str(of_millions) == "compact, 1.25 million weights, 2.5 MB"
     with pytest.raises(FormatError, match="bytes, got"):
         describe_weights(checkpoint(tmp_path / "cut.safetensors", cut=1))
     for junk in (b"", b"junk", b"version https://git-lfs.github.com/spec/v1\noid sha256:0"):

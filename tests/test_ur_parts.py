@@ -93,6 +93,7 @@ def test_nonsense_on_the_wire_is_refused():
         ({"host": "h", "controller_limits": "off"}, "ask or ignore"),
         ({"host": "h", "camera_speed": 3.0}, "camera_speed"),
         ({"host": "h", "workspace": [[0, 0, 0], [1, 1, -1]]}, "workspace"),
+        ({"host": "h", "workspace": [[0, 0, 0], [1, 1, 0]]}, "workspace"),
         ({"host": "h", "keep_out": [[0, 0, 0], [1, 1, 1]]}, "keep_out"),
     ],
 )

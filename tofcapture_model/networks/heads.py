@@ -49,8 +49,12 @@ _LEAST_REACH, _NO_LIMIT = 0.001, 0.5  # m
 _ANYTHING = 6e4  # float16 holds it
 _TAIL = 1e-3  # of a channel's values that count as strange in training
 _MARGIN = 0.25  # of its range that is allowed beyond
-_SOFT, _LEAST_SOFT = 0.1, 0.05  # of its range, and of the unit: from there on beyond, a channel is all strange
-_WHERE = slice(13, 16)  # channels that tell where a pixel is and whether it was measured: training on crops never sees all of them
+_SOFT, _LEAST_SOFT = (
+    0.1,
+    0.05,
+)  # of its range, and of the unit: from there on beyond, a channel is all strange
+# channels that tell where a pixel is and whether it was measured: training on crops never sees all of them
+_WHERE = slice(13, 16)
 _MIN_ERROR = 1e-3  # m; the same floor as in eq. 1
 _GAIN_UNIT = 5.0  # gains learn at the pace of the weights of a layer, which move by much less than 1
 
