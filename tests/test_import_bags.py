@@ -27,6 +27,38 @@ TF = "geometry_msgs/TransformStamped[] transforms"
 STORES = {"1": get_typestore(Stores.ROS1_NOETIC), "2": get_typestore(Stores.ROS2_HUMBLE)}
 STORES["1"].register(get_types_from_msg(TF, "tf2_msgs/msg/TFMessage"))
 FORMS = ("sqlite3", "mcap", "ros1", "json")
+FOXGLOVE = {  # fields of its messages in protobuf
+    "RawImage": "timestamp:Timestamp frame_id:s width:u height:u encoding:s step:u data:b",
+    "CameraCalibration": "timestamp:Timestamp frame_id:s width:u height:u distortion_model:s D:d* K:d* R:d* P:d*",
+    "FrameTransforms": "transforms:FrameTransform*",
+    "FrameTransform": "timestamp:Timestamp parent_frame_id:s child_frame_id:s translation:Vector3 rotation:Quaternion",
+    "Vector3": "x:d y:d z:d", "Quaternion": "x:d y:d z:d w:d",
+}  # fmt: skip
+
+
+def protobuf():
+    """What encodes Foxglove's messages, and their definition as an MCAP file holds it."""
+    pb2 = pytest.importorskip("google.protobuf.descriptor_pb2", reason="protobuf is not installed")
+    from google.protobuf import json_format, message_factory, timestamp_pb2
+
+    file = pb2.FileDescriptorProto(name="foxglove.proto", package="foxglove", syntax="proto3")
+    file.dependency.append("google/protobuf/timestamp.proto")
+    for name, fields in FOXGLOVE.items():
+        message = file.message_type.add(name=name)
+        for number, (field, kind) in enumerate((f.split(":") for f in fields.split()), start=1):
+            of = kind.rstrip("*")
+            number_of = {"s": 9, "u": 13, "b": 12, "d": 1}.get(of, 11)
+            package = "google.protobuf" if of == "Timestamp" else "foxglove"
+            more = {"type_name": f".{package}.{of}"} if number_of == 11 else {}
+            message.field.add(name=field, number=number, type=number_of, label=3 if kind != of else 1, **more)
+    stamp = pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
+    kinds = message_factory.GetMessages([stamp, file])
+
+    def encode(name, told):
+        return json_format.ParseDict(told, kinds[f"foxglove.{name}"]()).SerializeToString()
+
+    return encode, pb2.FileDescriptorSet(file=[stamp, file]).SerializeToString()
 
 
 class Bag:
@@ -34,7 +66,7 @@ class Bag:
 
     def __init__(self, path, form):
         self.path, self.form = path, form
-        self.store = STORES["1" if form == "ros1" else "2"]
+        self.store = STORES["1" if form in {"ros1", "mcap-ros1"} else "2"]
         self.rows = []  # topic, type, time of recording, message
 
     def kind(self, name):
@@ -42,7 +74,7 @@ class Bag:
 
     def header(self, time, frame):
         stamp = self.kind("builtin_interfaces/msg/Time")(sec=time // S, nanosec=time % S)
-        more = {"seq": 0} if self.form == "ros1" else {}
+        more = {"seq": 0} if self.store is STORES["1"] else {}
         return self.kind("std_msgs/msg/Header")(stamp=stamp, frame_id=frame, **more)
 
     def add(self, topic, kind, time, received=None, **fields):
@@ -72,7 +104,7 @@ class Bag:
     def camera(self, topic, time, shape=SHAPE, frame="tof", fx=None, tof=TOF):
         fx, fy = (tof["fx"], tof["fy"]) if fx is None else (fx, fx)
         K = np.array([fx, 0, tof["cx"], 0, fy, tof["cy"], 0, 0, 1.0])
-        names = "DKRP" if self.form == "ros1" else "dkrp"
+        names = "DKRP" if self.store is STORES["1"] else "dkrp"
         held = dict(zip(names, (np.zeros(5), K, np.eye(3).ravel(), np.zeros(12)), strict=True))
         roi = self.kind("sensor_msgs/msg/RegionOfInterest")(
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
@@ -128,8 +160,10 @@ class Bag:
         )  # fmt: skip
 
     def write(self):
-        if self.form == "json":
-            return self._write_json()
+        if self.form in {"json", "protobuf"}:
+            return self._write_foxglove()
+        if self.form in {"mcap-ros1", "mcap-cdr"}:
+            return self._write_mcap()
         if self.form == "ros1":
             writer = Writer1(self.path.with_suffix(".bag"))
         else:
@@ -144,10 +178,35 @@ class Bag:
                 writer.write(links[topic], time, encode(message, kind))
         return self.path.with_suffix(".bag") if self.form == "ros1" else self.path
 
-    def _write_json(self):
-        """As Foxglove's JSON, without ROS."""
+    def _write_mcap(self):
+        """As converters write it: no profile, no index."""
+        from mcap.writer import IndexType, Writer
+
+        path, ros1 = self.path.with_suffix(".mcap"), self.form == "mcap-ros1"
+        encode = self.store.serialize_ros1 if ros1 else self.store.serialize_cdr
+        with path.open("wb") as file:
+            writer = Writer(
+                file, index_types=IndexType.NONE, repeat_channels=False, use_summary_offsets=False
+            )
+            writer.start()
+            ids = {}
+            for topic, kind, time, m in sorted(self.rows, key=lambda r: r[2]):
+                name = kind.replace("/msg/", "/") if ros1 else kind
+                text = self.store.generate_msgdef(kind, ros_version=1 if ros1 else 2)[0].encode()
+                if topic not in ids:
+                    schema = writer.register_schema(name, "ros1msg" if ros1 else "ros2msg", text)
+                    ids[topic] = writer.register_channel(topic, "ros1" if ros1 else "cdr", schema)
+                writer.add_message(ids[topic], time, bytes(encode(m, kind)), time)
+            writer.finish()
+        return path
+
+    def _write_foxglove(self):
+        """As Foxglove's JSON or protobuf, without ROS."""
         from mcap.writer import Writer
 
+        encode, schema = (
+            protobuf() if self.form == "protobuf" else (lambda _, told: json.dumps(told).encode(), b"{}")
+        )
         path = self.path.with_suffix(".mcap")
         with path.open("wb") as file:
             writer = Writer(file)
@@ -157,7 +216,7 @@ class Bag:
                 name = {
                     "Image": "RawImage",
                     "CameraInfo": "CameraCalibration",
-                    "TFMessage": "FrameTransform",
+                    "TFMessage": "FrameTransforms" if self.form == "protobuf" else "FrameTransform",
                 }[kind.split("/")[-1]]
                 head = getattr(m, "header", None) or m.transforms[0].header
                 told = {
@@ -176,10 +235,16 @@ class Bag:
                     told["translation"] = {c: getattr(one.transform.translation, c) for c in "xyz"}
                     told["rotation"] = {c: getattr(one.transform.rotation, c) for c in "xyzw"}
                 if topic not in ids:
+                    of = "jsonschema" if self.form == "json" else self.form
                     ids[topic] = writer.register_channel(
-                        topic, "json", writer.register_schema(f"foxglove.{name}", "jsonschema", b"{}")
+                        topic, self.form, writer.register_schema(f"foxglove.{name}", of, schema)
                     )
-                writer.add_message(ids[topic], time, json.dumps(told).encode(), time)
+                if self.form == "protobuf":
+                    told["timestamp"] = f"{np.datetime64(time, 'ns')}Z"
+                    if name == "FrameTransforms":
+                        del told["frame_id"]
+                    told = {"transforms": [told]} if name == "FrameTransforms" else told
+                writer.add_message(ids[topic], time, encode(name, told), time)
             writer.finish()
         return path
 
@@ -205,8 +270,13 @@ def written(path, form="sqlite3", raw="stacked", views=3, change=None):
     return bag.write()
 
 
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("raw", ["stacked", "topics", "turns"])
+@pytest.mark.parametrize(
+    ("form", "raw"),
+    [
+        *((form, raw) for form in FORMS for raw in ("stacked", "topics", "turns")),
+        *((form, "stacked") for form in ("protobuf", "mcap-ros1", "mcap-cdr")),
+    ],
+)
 def test_a_bag_gives_the_views_of_its_arrays(tmp_path, form, raw):
     """Raw taps and depths bit for bit, the intrinsics of CameraInfo, stamps, poses between those of tf."""
     path = written(tmp_path / "mug", form, raw)

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from tofcapture.camera import Camera
 from tofcapture.errors import ConfigError, DataError, FormatError
@@ -116,6 +117,23 @@ FILES = {
     "tof.toml": text(
         f"[tof]\nwidth = 240\nheight = 180\nfx = 190.6\nfy = 200.8\ncx = 116.8\ncy = 101.5\ndistortion = {list(LENS)}\n"
     ),
+    "calib.mat": lambda p: savemat(p, {"K": np.reshape(K, (3, 3)), "dist": LENS, "image_size": (240, 180)}),
+    "realsense.json": table(
+        {
+            "width": 240,
+            "height": 180,
+            "ppx": 116.8,
+            "ppy": 101.5,
+            "fx": 190.6,
+            "fy": 200.8,
+            "coeffs": list(LENS),
+            "model": "brown_conrady",
+        }
+    ),
+    "orbslam.yaml": text(
+        "%YAML:1.0\nCamera.fx: 190.6\nCamera.fy: 200.8\nCamera.cx: 116.8\nCamera.cy: 101.5\nCamera.width: 240\nCamera.height: 180\n"
+        + "".join(f"Camera.{k}: {v}\n" for k, v in zip(("k1", "k2", "p1", "p2", "k3"), LENS, strict=True))
+    ),
     "utf16.yaml": lambda p: p.write_text(ROS, encoding="utf-16"),
 }
 
@@ -128,6 +146,16 @@ def test_every_tool_means_the_same_camera(tmp_path, name):
     assert found.shape == WANTED.shape
     for key in ("fx", "fy", "cx", "cy", "distortion"):
         np.testing.assert_allclose(getattr(found, key), getattr(WANTED, key), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["K.npy", "K.txt", "K.csv"])
+def test_a_matrix_alone_is_a_camera(tmp_path, name):
+    """As NumPy saves it; the size comes from the images."""
+    if name == "K.npy":
+        np.save(tmp_path / name, np.reshape(K, (3, 3)))
+    else:
+        np.savetxt(tmp_path / name, np.reshape(K, (3, 3)), delimiter="," if name == "K.csv" else " ")
+    assert camera_keys(str(tmp_path / name)) == {"fx": 190.6, "fy": 200.8, "cx": 116.8, "cy": 101.5}
 
 
 def test_colmaps_folder_is_its_camera(tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import h5py
 import numpy as np
 import pytest
@@ -10,8 +12,10 @@ from tofcapture.cli import main
 from tofcapture.errors import TofError
 from tofcapture.files.check import check
 from tofcapture.files.view import find_views, open_view
+from tofcapture.importing.poses import read_poses
 from tofcapture.importing.said import Said
 from tofcapture.importing.views import UNFINISHED, import_data
+from tofcapture.poses import exp
 
 SHAPE = (30, 40)
 TOF = {"fx": 45.0, "fy": 46.0, "cx": 19.0, "cy": 15.5}
@@ -178,6 +182,26 @@ def _write(form, folder, raw, depth):
             (folder / f"raw{i}.raw").write_bytes(raw[i].astype(">u2").tobytes())
             np.save(folder / f"depth{i}.npy", depth[i])
         return {"raw": {"shape": list(SHAPE)}}
+    elif form == "words-of-floats":
+        for i in range(len(raw)):
+            (folder / f"raw{i}.bin").write_bytes(raw[i].astype("<u2").tobytes())
+            (folder / f"depth{i}.bin").write_bytes(depth[i].astype("<f4").tobytes())
+        return {"raw": {"shape": list(SHAPE)}}
+    elif form == "channels-first":
+        np.save(folder / "raw.npy", np.moveaxis(raw, 0, -1))
+        np.save(folder / "depth.npy", np.moveaxis(depth, 0, -1))
+    elif form == "frequencies-and-phases":
+        np.savez(folder / "mug.npz", raw=raw.reshape(-1, 2, 4, *SHAPE), depth=depth)
+    elif form == "frequencies-apart":
+        with h5py.File(folder / "mug.h5", "w") as file:
+            file["raw/20MHz"], file["raw/100MHz"], file["depth"] = raw[:, :4], raw[:, 4:], 1000.0 * depth
+            file["depth"].attrs["units"] = "millimetres"
+    elif form == "channels-apart":
+        taps = {f"I{k}": raw[:, k] for k in range(8)}
+        np.savez(folder / "mug.npz", **taps, depth_mm=np.float64(1000) * depth)
+    elif form == "told-apart":
+        np.savez(folder / "mug.npz", x=raw, y=depth)
+        return {"scene": "mug", "raw": {"files": "*:x"}, "truth": {"files": "*:y"}}
     elif form == "points":
         v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
         rays = np.stack([(u - TOF["cx"]) / TOF["fx"], (v - TOF["cy"]) / TOF["fy"], 1 + 0 * u], axis=-1)
@@ -188,7 +212,7 @@ def _write(form, folder, raw, depth):
 
 
 FORMS = (
-    "npy", "big-endian", "npz", "npz-scene", "mat", "mat73", "mat-scene", "mat-struct", "mat-cells", "mat73-cells", "pages", "organised", "hdf5", ".png", ".tif", "millimetres", "turned", "folders", "words", "points",
+    "npy", "big-endian", "npz", "npz-scene", "mat", "mat73", "mat-scene", "mat-struct", "mat-cells", "mat73-cells", "pages", "organised", "hdf5", ".png", ".tif", "millimetres", "words-of-floats", "channels-first", "frequencies-and-phases", "frequencies-apart", "channels-apart", "told-apart", "turned", "folders", "words", "points",
 )  # fmt: skip
 
 
@@ -330,8 +354,21 @@ def wrong(folder):
             lambda: none(*(np.save(folder / f"raw_{1700000000 + i}.500000.npy", r) for i, r in enumerate(raw)))
             or _poses(folder, none, "".join(f"{i} 0 0 0 0 0 0 1\n" for i in range(3))), "within 0.1 s", "time_offset_s"
         ),
-        "poses of COLMAP": (lambda: _poses(folder, put, "1 1 0 0 0 0 0 0 1 raw_0.npy\n\n" * 3), "line 1", "x y z qx qy qz qw"),
+        "poses of angles": (lambda: _poses(folder, put, "x,y,z,roll,pitch,yaw\n" + "0,0,0,0,0,0\n" * 3), "got x, y, z, roll", "from_euler"),
+        "poses in short lines": (lambda: _poses(folder, put, "0 0 0\n" * 3), "lines of 7, 12 or 16", "one pose a line"),
         "a layout of nobody": (lambda: put(raw_={"layout": "acme"}), "arducam-b0410", ""),
+        "depth as text": (lambda: none(put(d=None), np.savetxt(folder / "depth_0.txt", np.tile(depth[0], (2, 1)))), "got depth_0.txt", "np.loadtxt"),
+        "depth pickled": (lambda: none(put(d=None), (folder / "depth_0.pkl").write_bytes(b"")), "got depth_0.pkl", "np.save"),
+        "a packed bag": (lambda: none((folder / "mug.db3.zstd").write_bytes(b"")), "found mug.db3.zstd", "zstd -d"),
+        "a bag that was being recorded": (lambda: none((folder / "mug.bag.active").write_bytes(b"")), "mug.bag.active", "reindex"),
+        "words of another suffix": (lambda: none(put(), (folder / "raw_3.dat").write_bytes(b"")), "got raw_3.dat", "--shape"),
+        "disparities": (lambda: none(put(d=None), np.save(folder / "disparity_0.npy", 40 / depth[0])), "got disparities", "baseline"),
+        "names of nobody": (lambda: np.savez(folder / "mug.npz", x=raw, y=depth), "names that say which", '[truth] files = "*:y"'),
+        "channels that are words": (
+            lambda: none(put(raw[:0]), *(np.save(folder / f"{w}_{i}.npy", raw[i, s]) for i in range(3) for w, s in (("hf", slice(4)), ("lf", slice(4, 8))))),
+            "only one of them for hf, lf", "020MHz"
+        ),
+        "a TIFF that OpenCV does not read": (lambda: none(put(d=None), (folder / "depth_0.tif").write_bytes(b"II*\0")), "depth_0.tif", "np.save"),
         "a kind of nobody": (lambda: put(truth={"kind": "disparity"}), "kind", ""),
         "poses too few": (lambda: _poses(folder, put, "0 0 0 0 0 0 1\n"), "a pose for each of 3 views, got 1", "one line"),
         "quaternion that is none": (lambda: _poses(folder, put, "0 0 0 1 2 3 4\n" * 3), "unit quaternion", "order"),
@@ -434,6 +471,68 @@ def test_a_trajectory_of_stamps_places_views_by_the_stamps_of_their_names(tmp_pa
     np.testing.assert_allclose(
         [v.arm_before.T_base_flange[0, 3] for v in views], [0.505, 1.505, 2.505], atol=1e-6
     )
+
+
+def _trajectories(T, q):
+    """Files of two poses (2, 4, 4) with quaternions x y z w, as tools write them."""
+    p, w, rows, back = T[:, :3, 3], np.roll(q, 1, axis=1), T.reshape(2, 16), np.linalg.inv(T)
+    turned, gl = np.roll(q * [-1, -1, -1, 1], 1, axis=1), T @ np.diag([1.0, -1, -1, 1])
+
+    def lines(*columns, head="", sep=","):
+        return head + "".join(sep.join(map(str, r)) + "\n" for r in np.column_stack(columns).tolist())
+
+    def blocks(n, head=""):
+        return "\n".join(head + "\n".join(" ".join(map(str, r)) for r in one[:n].tolist()) for one in T)
+
+    euroc = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],v_RS_R_x [m s^-1]\n"
+    ros = (
+        "%time,"
+        + ",".join(
+            f"field.pose.{n}"
+            for n in ("position.x", "position.y", "position.z", *(f"orientation.{c}" for c in "xyzw"))
+        )
+        + "\n"
+    )
+    return {
+        "tum.txt": lines([1, 2], p, q, head="# timestamp tx ty tz qx qy qz qw\n", sep=" "),
+        "kitti.txt": lines(rows[:, :12], sep=" "),
+        "euroc.csv": lines([1, 2], p, w, [9, 9], head=euroc),
+        "ros.csv": lines([1, 2], p, q, head=ros),
+        "units.csv": lines([1, 2], 1000 * p, q, head="time [s],x [mm],y [mm],z [mm],qx,qy,qz,qw\n"),
+        "index.csv": lines([7, 8], [1, 2], p, q, head=",timestamp,x,y,z,qx,qy,qz,qw\n"),
+        "german.csv": lines([1, 2], p, q, head="t;x;y;z;qx;qy;qz;qw\n", sep=";").replace(".", ","),
+        "named.csv": "file,x,y,z,qx,qy,qz,qw\n" + "".join(f"a{i}.png,{lines(p[i : i + 1], q[i : i + 1])}" for i in (0, 1)),
+        "blocks.txt": blocks(4), "blocks-3.txt": blocks(3), "redwood.log": blocks(4, "0 0 1\n"),
+        "images.txt": "".join(f"{i} {lines(turned[i : i + 1], back[i : i + 1, :3, 3], sep=' ').strip()} 1 a{i}.png\n1 2 -1\n" for i in (1, 0)),
+        "list.json": json.dumps(T.tolist()), "names.json": json.dumps({f"{i}": {"T": one.tolist()} for i, one in enumerate(T)}),
+        "nerf.json": json.dumps({"frames": [{"file_path": f"{i}.png", "transform_matrix": gl[i].tolist()} for i in (1, 0)]}),
+        "a.npy": T, "b.npy": T[:, :3], "c.npy": np.column_stack([p, q]), "d.npz": {"K": np.eye(3), "poses": T}, "e.mat": {"T": np.moveaxis(T, 0, -1)},
+    }  # fmt: skip
+
+
+def test_poses_of_every_tool_are_the_same(tmp_path):
+    """Order of columns, units and names come from headers; COLMAP's are inverted, nerfstudio's turned; a folder has a file each."""
+    T = np.stack([exp([0.3, -0.2, 0.1, 0.4, 0.1, -0.7]), exp([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])])
+    q = np.stack(
+        [
+            pytest.importorskip("scipy.spatial").transform.Rotation.from_matrix(R).as_quat()
+            for R in T[:, :3, :3]
+        ]
+    )
+    forms = {"utf-16.txt": _trajectories(T, q)["tum.txt"], **_trajectories(T, q)}
+    for name, held in forms.items():
+        path = tmp_path / name
+        if isinstance(held, str):
+            path.write_text(held, encoding="utf-16" if name.startswith("utf") else "utf-8")
+        elif name.endswith(".mat"):
+            _matlab(path, held)
+        else:
+            np.savez(path, **held) if isinstance(held, dict) else np.save(path, held)
+        np.testing.assert_allclose(read_poses(path, Said())[1], T, atol=1e-9, err_msg=name)
+    (tmp_path / "each").mkdir()
+    for i in (0, 1):
+        np.savetxt(tmp_path / f"each/{i}.txt", T[i])
+    np.testing.assert_allclose(read_poses(tmp_path / "each", Said())[1], T, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", NAMES)

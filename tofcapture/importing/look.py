@@ -81,6 +81,8 @@ def guess(source: Path) -> str:
 
 def _guessed_truth(found: list[Planned]) -> str:
     """Guess the unit of ground truth: the first in which its median is one of a room."""
+    if not found:
+        return '# [truth]\n# kind = "depth"\n# unit = "m"\n'
     target = next((v for v in found if v.truth is not None), None)
     if target is None or target.truth is None:
         return '[truth]\nkind = "none"\n'

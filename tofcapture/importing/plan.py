@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.errors import DataError
+from tofcapture.errors import DataError, PassedOver
 from tofcapture.files.view import check_scene_name
 from tofcapture.importing.poses import poses_of, read_poses
 from tofcapture.importing.readers.vendors import decode, facts_of_layout
@@ -75,10 +76,27 @@ AXIS = (
     | CHANNEL
     | FRAME
     | frozenset(
-        ["v", "view", "views", "pose", "poses", "shot", "img", "image", "n", "no", "npy", "data", "array"]
+        [
+            "v",
+            "view",
+            "views",
+            "pose",
+            "poses",
+            "shot",
+            "img",
+            "image",
+            "n",
+            "no",
+            "npy",
+            "data",
+            "array",
+            "mm",
+            "cm",
+        ]
     )
 )
 MOST_NAMED = 5
+_FEW = 8  # arrays whose shapes are looked at before anything else
 SURFACES = (".ply", ".pcd", ".stl", ".obj")
 Array = NDArray[Any]
 Key = tuple[int, ...]
@@ -122,6 +140,7 @@ def plan(source: Path, said: Said) -> list[Planned]:
     if not any(n.role == "raw" for n in named):
         # Names that say nothing are raw, unless others say that they are.
         named = [replace(n, role="raw") if n.role == "" else n for n in named]
+        _expect_alike([n.piece for n in named if n.role == "raw"], source)
     named = [_taken_apart(n, said) if n.role == "raw" else n for n in named]
     raw = _scenes([n for n in named if n.role == "raw"], said, source)
     if not raw:
@@ -132,6 +151,8 @@ def plan(source: Path, said: Said) -> list[Planned]:
     truth = _scenes([n for n in named if n.role == "truth"], said, source)
     if said.truth.get("kind") == "none":
         truth = {}
+    elif not truth:
+        _tell_unnamed([n.piece.name for n in named if n.role == ""], source)
     if len(raw) == 1 and len(truth) == 1:
         truth = dict(zip(raw, truth.values(), strict=True))
     _expect_same_scenes(raw, truth, source)
@@ -142,6 +163,32 @@ def plan(source: Path, said: Said) -> list[Planned]:
         views = _views(found, truth.get(scene, []), said, channels, size, source)
         out += [replace(v, scene=check_scene_name(scene), index=i) for i, v in enumerate(views)]
     return _posed(out, [n.piece for n in named if n.role == "pose"], said, source)
+
+
+def _expect_alike(pieces: list[Piece], source: Path) -> None:
+    """Refuse arrays of several axes of which no name says what they are."""
+    if len(pieces) < 2 or len(pieces) > _FEW:
+        return
+    shapes = {p.name: p.load().shape for p in pieces}
+    if len({len(s) for s in shapes.values()}) > 1:
+        told = ", ".join(f"{n} {s}" for n, s in shapes.items())
+        one, other = (f"*{n[n.rfind(':') :]}" if ":" in n else n for n in list(shapes)[:2])
+        raise DataError(
+            f"{source}: expected names that say which arrays are raw and which ground truth, got {told[:300]}",
+            hint=f'[raw] files = "{one}" and [truth] files = "{other}" in import.toml; or call them raw and depth',
+        )
+
+
+def _tell_unnamed(names: list[str], source: Path) -> None:
+    """Say which arrays are not taken, where ground truth is missing: they may be it."""
+    if any("disp" in n.lower() for n in names):
+        raise DataError(
+            f"{source}: expected depths, got disparities: {_some(names)}",
+            hint="depth = fx * baseline / disparity, in metres, saved as depth-000.npy; or move them away",
+        )
+    if names:
+        text = f"{source}: no name says what {_some(names)} are: left out"
+        warnings.warn(f'{text}; [truth] files = "..." in import.toml takes them', PassedOver, stacklevel=2)
 
 
 def _posed(views: list[Planned], pieces: list[Piece], said: Said, source: Path) -> list[Planned]:
@@ -163,7 +210,7 @@ def _posed(views: list[Planned], pieces: list[Piece], said: Said, source: Path) 
 def _named(piece: Piece, said: Said) -> _Named:
     place, _, array = piece.name.partition(":")
     parts = [*Path(place).with_suffix("").parts, *([array] if array else [])]
-    words, numbers, roles, folders = list[str](), list[tuple[str, int]](), set[str](), 0
+    words, numbers, roles, folders, unit = list[str](), list[tuple[str, int]](), set[str](), 0, ""
     for depth, part in enumerate(parts):
         last = ""
         for word, digits in re.findall(r"([A-Za-z]+)|(\d+)", part):
@@ -171,6 +218,7 @@ def _named(piece: Piece, said: Said) -> _Named:
                 numbers.append((last.lower(), int(digits)))
                 continue
             last, low = word, word.lower()
+            unit = low if low in {"mm", "cm"} else unit
             roles |= {r for r, known in (("truth", TRUTH), ("raw", RAW), ("other", OTHER)) if low in known}
             if low not in AXIS:
                 words.append(word)
@@ -182,6 +230,8 @@ def _named(piece: Piece, said: Said) -> _Named:
         if (pattern := table.get("files")) and not piece.role:
             matches = fnmatch(piece.name, str(pattern)) or fnmatch(Path(place).name, str(pattern))
             role = name if matches else ("" if role == name else role)
+    if role == "truth" and unit:
+        piece = replace(piece, facts=piece.facts.over(Facts(unit=unit)))
     return _Named(piece, role, tuple(words), folders, tuple(numbers))
 
 
@@ -233,7 +283,8 @@ def _expect_same_scenes(raw: Mapping[str, Any], truth: Mapping[str, Any], source
     if alone:
         raise DataError(
             f"{source}: expected raw arrays and ground truth for every scene, got only one of them for {_some(alone)}",
-            hint='give pairs the same name: mug.npy and mug_depth.npy; or [truth] kind = "none" in import.toml',
+            hint="give pairs the same name, mug.npy and mug_depth.npy, and channels numbers, not words: low_90 is 020MHz_90; "
+            'or --scene NAME, where all are one scene; or [truth] kind = "none" in import.toml',
         )
 
 
@@ -256,7 +307,11 @@ def _views(
         where = str(pieces[0].path)
         if len(arrays) == 1:
             return in_order(arrays[0], K, size, axes, where)
-        if not axes and (arrays[0].ndim == 2 or (arrays[0].ndim == 3 and len(arrays[0]) < K)):
+        held = K if axes else _held(arrays[0].shape, K)
+        if arrays[0].ndim > 2 and len(arrays) * (held if arrays[0].ndim == 4 else 1) == K:
+            join = np.stack if arrays[0].ndim == 3 else np.concatenate
+            return in_order(join(arrays, axis=1), K, size, "FKHW", where)
+        if held < K:
             join = np.stack if arrays[0].ndim == 2 else np.concatenate
             return in_order(join(arrays), K, size, "", where)
         frames = [in_order(a, K, size, axes, where)[0] for a in arrays]
@@ -362,12 +417,7 @@ def _grouped(raw: list[_Named], said: Said, K: int) -> dict[Key, list[Piece]]:
     """Group raw pieces into views by the numbers in their names; the pieces of a group are in order: frames, then channels."""
     raw = sorted(raw, key=lambda n: natural(n.piece.name))
     first = raw[0].piece.load()
-    few = first.ndim == 2 or (
-        first.ndim == 3 and len(first) < K and K % len(first) == 0 and first.shape[-1] != K
-    )
-    need = (
-        K // (len(first) if first.ndim == 3 else 1) if few and not said.raw.get("axes") else 1
-    )  # files of a frame
+    need = 1 if said.raw.get("axes") else K // _held(first.shape, K)  # files of a frame
     if len({len(n.numbers) for n in raw}) > 1 or len(raw) == 1:
         return _in_turn(raw, need)
     columns = [[n.numbers[i] for n in raw] for i in range(len(raw[0].numbers))]
@@ -379,6 +429,8 @@ def _grouped(raw: list[_Named], said: Said, K: int) -> dict[Key, list[Piece]]:
         varying += [i] if many[i] > 1 and not told else []
     if prod(many[i] for i in varying) != len(raw):
         return _in_turn(raw, need, _gaps(columns, varying))
+    if first.ndim == 3 and len(raw) == K and [columns[i][0][0] in CHANNEL for i in varying] == [True]:
+        need = K  # a channel's images of all views in each file
     inner = _channel_columns(varying, many, columns, need) if need > 1 else []
     if need > 1 and not inner:
         return _in_turn(raw, need)
@@ -391,6 +443,15 @@ def _grouped(raw: list[_Named], said: Said, K: int) -> dict[Key, list[Piece]]:
         key = tuple(values[i] for i in rest if i not in frames)
         out.setdefault(key, []).append((tuple(values[i] for i in (*frames, *inner)), n.piece))
     return {k: [p for _, p in sorted(found, key=lambda f: f[0])] for k, found in sorted(out.items())}
+
+
+def _held(shape: tuple[int, ...], K: int) -> int:
+    """Count the channels that an array has of K: one image, some of them (k, H, W), or of several frames (F, k, H, W)."""
+    if len(shape) == 2:
+        return 1
+    k = shape[-3] if len(shape) in (3, 4) else K
+    whole = K in (shape[0], shape[-1], k * shape[0] if len(shape) == 4 else k)
+    return k if K % k == 0 and not whole else K
 
 
 def _channel_columns(

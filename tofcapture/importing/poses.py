@@ -1,37 +1,43 @@
-"""Read where the camera stood: TUM and CSV lines of numbers, matrices of NumPy, nerfstudio's ``transforms.json``."""
+"""Read where the camera stood: lines of TUM, KITTI, EuRoC and CSV, matrices, nerfstudio's ``transforms.json``, COLMAP's ``images.txt``."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tofcapture.errors import DataError
+from tofcapture.importing.cameras.trees import decoded
+from tofcapture.importing.readers.arrays import SUFFIXES, arrays_of
 from tofcapture.importing.said import Said
+from tofcapture.importing.source import natural
 from tofcapture.meshes import UNITS
 from tofcapture.poses import Float64, check_transform, exp, invert, log, transform
 
 _APART = 0.1  # s that a pose may be away from the frame that it is taken for
 _UNITS_OF_TIME = (1.0, 1e-3, 1e-6, 1e-9)  # s, ms, us, ns; the one in which poses and frames meet is taken
 _WIDE = 100.0  # m between two poses of a camera that measures some metres
-_NAMES = {"qx": 3, "qy": 4, "qz": 5, "qw": 6, "x": 0, "y": 1, "z": 2}
+_PLACES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's cameras look along -z, y up
 _FORMS = "lines of x y z qx qy qz qw, or of a matrix by rows, with a stamp before them or not; or (N, 4, 4) as .npy"
+_COUNTS = {7, 8, 12, 13, 16, 17}
+Rows = list[list[float]]
 
 
 def read_poses(path: Path, said: Said) -> tuple[Float64 | None, Float64]:
     """Read stamps (n,) in the file's unit, or ``None``, and poses (n, 4, 4) of the camera in the world, metres.
 
     A line has x y z qx qy qz qw, or the 12 or 16 numbers of a matrix, row by row; before them a stamp, or none. A header that names
-    these columns may have them in another order. :class:`DataError` names the first line that is none of these.
+    these columns may have them in another order, with others between them, and their unit. A folder has a matrix in each file.
+    :class:`DataError` names the first line that is none of these.
     """
-    rows = _rows(path)
+    rows, unit = _rows(path)
     counts = {len(row) for row in rows}
-    if len(counts) != 1 or not counts <= {7, 8, 12, 13, 16, 17}:
+    if len(counts) != 1 or not counts <= _COUNTS:
         raise DataError(
             f"{path}: expected lines of 7, 12 or 16 numbers, or one more with a stamp, got {sorted(counts) or 'none'}",
             hint="TUM: stamp x y z qx qy qz qw, one pose a line",
@@ -44,7 +50,7 @@ def read_poses(path: Path, said: Said) -> tuple[Float64 | None, Float64]:
             hint="was the camera lost there? leave this view and its pose out",
         )
     stamped = counts <= {8, 13, 17}
-    scale = UNITS[str(said.poses.get("unit", "m"))]
+    scale = UNITS[str(said.poses.get("unit", unit or "m"))]
     poses = np.stack(
         [_pose(row, scale, f"{path}: pose {i + 1}") for i, row in enumerate(table[:, int(stamped) :])]
     )
@@ -58,51 +64,129 @@ def read_poses(path: Path, said: Said) -> tuple[Float64 | None, Float64]:
     return (table[:, 0] if stamped else None), poses
 
 
-def _rows(path: Path) -> list[list[float]]:
-    """Rows of numbers of a file, those of a header in our order."""
+def _rows(path: Path) -> tuple[Rows, str]:
+    """Rows of numbers in our order, and the unit of the places where a header says it."""
     try:
-        if path.suffix.lower() == ".npy":
-            return np.load(path, allow_pickle=False).astype(np.float64).reshape(-1, 16).tolist()  # type: ignore[no-any-return]
-        text = path.read_text(encoding="utf-8-sig")
+        if path.is_dir():
+            files = sorted((p for p in path.iterdir() if p.is_file()), key=lambda p: natural(p.name))
+            return [[x for row in _rows(f)[0] for x in row] for f in files if f.name[0] != "."], ""
+        if path.suffix.lower() in SUFFIXES:
+            return _of_arrays(arrays_of(path)), ""
+        text = decoded(path.read_bytes())
         if text.lstrip()[:1] in {"{", "["}:
-            return _of_json(json.loads(text))
+            return _of_json(json.loads(text)), ""
     except (OSError, ValueError, KeyError, TypeError) as err:
         raise DataError(f"{path}: cannot read the poses: {err}", hint=_FORMS) from err
-    rows, order = list[list[float]](), list[int]()
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = [w.strip("\"'") for w in re.split(r"[,;\s]+", line.strip(" \t#,;")) if w]
-        if not words or line.lstrip().startswith("#") or not _is_number(words[0]):
-            order = order or _order(words)
+    lines = [line.strip() for line in text.splitlines()]
+    if (colmap := _of_colmap(lines)) is not None:
+        return colmap, ""
+    return _of_lines(lines, path)
+
+
+def _of_lines(lines: Sequence[str], path: Path) -> tuple[Rows, str]:
+    apart = next((c for c in ";,\t" if any(c in line for line in lines)), None)
+    rows, columns, unit = Rows(), list[int](), ""
+    for number, line in enumerate(lines, start=1):
+        commas = apart in {";", "\t"} and re.search(r"\d,\d", line)  # decimal commas
+        words = [
+            w.strip(" \"'") for w in (line.replace(",", ".") if commas else line).strip("#% ").split(apart)
+        ]
+        words = words if len(words) > 1 or not apart else line.split()
+        if columns and len(words) > max(columns) and line[0] != "#":
+            words = [words[i] for i in columns]
+        elif not any(words) or line.startswith("#") or not _is_number(words[0]):
+            if not columns and (named := _columns(words, path)):
+                columns, unit = named
+            elif rows and any(words) and not line.startswith("#"):
+                raise DataError(f"{path}: line {number}: expected numbers, got {line[:60]!r}", hint=_FORMS)
             continue
         try:
-            row = [float(w) for w in words]
+            rows.append([float(w) for w in words if w])
         except ValueError as err:
             raise DataError(
                 f"{path}: line {number}: expected numbers, got {line[:60]!r}", hint=_FORMS
             ) from err
-        rows.append([row[i] for i in order] if order and len(row) > max(order) else row)
-    return rows
+    return _joined(rows), unit
 
 
-def _of_json(held: Any) -> list[list[float]]:
-    """Rows of matrices of a list, or of nerfstudio's frames in the order of their files."""
-    if isinstance(held, dict):
-        frames = sorted(held["frames"], key=lambda f: str(f["file_path"]))
+def _joined(rows: Rows) -> Rows:
+    """Join the lines of matrices that stand below each other, 3 or 4 of 4 numbers, with or without a line of 3 before them."""
+    rows = (
+        [r for r in rows if len(r) != 3]
+        if len(rows) % 5 == 0 and all(len(r) == 3 for r in rows[::5])
+        else rows
+    )
+    if {len(r) for r in rows} != {4}:
+        return rows
+    of = 4 if len(rows) % 4 == 0 and all(r == [0, 0, 0, 1] for r in rows[3::4]) else 3
+    return [[x for row in rows[i : i + of] for x in row] for i in range(0, len(rows), of)]
+
+
+def _columns(words: Sequence[str], path: Path) -> tuple[list[int], str] | None:
+    """Find the columns of stamp and pose that a header names, in our order, and their unit; ``None`` when it is none."""
+    found, unit = dict[str, int](), ""
+    for i, word in enumerate(words):
+        parts = [p for p in re.split(r"[^a-z0-9]+", word.lower()) if p]
+        unit = next((p for p in parts if p in {"mm", "cm"}), unit)
+        parts = [p for p in parts if p not in {"m", "mm", "cm", "s", "ns", "ms"}]
+        name = parts[-1] if parts else ""
+        turn = any(p[0] == "q" or p.startswith(("quat", "orient", "rot")) for p in parts)
+        if match := re.fullmatch(r"(?:q|quat|quaternion|orientation)?([xyzw])", name) if turn else None:
+            found.setdefault(f"q{match[1]}", i)
+        elif match := re.fullmatch(r"(?:pos|position|p|t|trans|translation)?([xyz])", name):
+            found.setdefault(match[1], i)
+        elif re.match(r"time|stamp|t$|sec", name):
+            found.setdefault("time", i)
+    if not {"x", "y", "z"} <= found.keys() or len(words) < len(_PLACES) - 1:
+        return None
+    if not set(_PLACES) <= found.keys():
+        raise DataError(
+            f"{path}: expected columns {' '.join(_PLACES)}, got {', '.join(words)[:120]}",
+            hint="angles: scipy's Rotation.from_euler(...).as_quat() gives qx qy qz qw",
+        )
+    return [*([found["time"]] if "time" in found else []), *(found[n] for n in _PLACES)], unit
+
+
+def _of_arrays(held: Mapping[str, Any]) -> Rows:
+    """Rows of the one array of poses: (N, 4, 4), (N, 3, 4), MATLAB's (4, 4, N), or a table."""
+    arrays = [np.asarray(a, np.float64) for a in held.values() if a.dtype.kind in "iuf" and a.ndim in (2, 3)]
+    arrays += [np.moveaxis(a, -1, 0) for a in arrays if a.ndim == 3]
+    rigid = [a for a in arrays if a.shape[-2:] in {(4, 4), (3, 4)}]
+    rigid.sort(key=lambda a: not (a[..., 3:, :] == [0, 0, 0, 1]).all())
+    found = next(iter(rigid), next((a for a in arrays if a.ndim == 2 and a.shape[1] in _COUNTS), None))
+    if found is None:
+        raise ValueError(
+            f"no array (N, 4, 4), got {', '.join(str(a.shape) for a in held.values()) or 'none'}"
+        )
+    return [row.ravel().tolist() for row in (found if found.ndim == 3 or not rigid else [found])]
+
+
+def _of_json(held: Any) -> Rows:
+    """Rows of matrices of a list or by name, or of nerfstudio's frames in the order of their files."""
+    if isinstance(held, dict) and "frames" in held:
+        frames = sorted(held["frames"], key=lambda f: natural(str(f["file_path"])))
         held = [np.asarray(f["transform_matrix"], np.float64).reshape(4, 4) @ _OPENGL for f in frames]
-    return np.asarray(held, dtype=np.float64).reshape(-1, 16).tolist()
+    elif isinstance(held, dict):
+        held = [held[name] for name in sorted(held, key=natural)]
+    held = [next(v for v in m.values() if np.size(v) in (12, 16)) if isinstance(m, dict) else m for m in held]
+    return [np.asarray(m, dtype=np.float64).ravel().tolist() for m in held]
+
+
+def _of_colmap(lines: Sequence[str]) -> Rows | None:
+    """Rows of matrices of ``images.txt`` in the order of the pictures' names; ``None`` for anything else."""
+    rows = [line.split() for line in lines if line and not line.startswith("#")]
+    rows = [r for r in rows if len(r) == 10 and r[0].isdecimal() and re.search("[A-Za-z]", r[-1])]
+    if not rows:
+        return None
+    out = Rows()
+    for row in sorted(rows, key=lambda r: natural(r[-1])):
+        w, x, y, z, *t = (float(v) for v in row[1:8])
+        out.append(invert(_pose(np.array([*t, x, y, z, w]), 1.0, row[-1])).ravel().tolist())
+    return out
 
 
 def _is_number(word: str) -> bool:
     return bool(re.fullmatch(r"[-+]?(\d.*|\.\d.*|nan|inf(inity)?)", word.lower()))
-
-
-def _order(words: Sequence[str]) -> list[int]:
-    """Columns of stamp and pose in our order, where a header names them; empty when it is none."""
-    names = [re.sub(r"^(?:pos_?|p_?|t_?)(?=[xyz]$)|^.*[./](?=\w+$)|_", "", w.lower()) for w in words]
-    if not _NAMES.keys() <= set(names) or len(names) not in {7, 8}:
-        return []
-    pose = [names.index(n) for n in sorted(_NAMES, key=_NAMES.__getitem__)]
-    return [i for i in range(len(names)) if i not in pose] + pose
 
 
 def _pose(row: Float64, scale: float, where: str) -> Float64:

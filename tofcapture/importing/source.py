@@ -28,17 +28,23 @@ Role = Literal["", "raw", "truth", "pose", "other"]
 READERS = ("bags", "bop", "arrays", "images", "clouds")
 """Modules of :mod:`tofcapture.importing.readers`, asked in this order; the first that claims a path reads it."""
 _VIDEO = "a video loses what is measured: export frames as 16-bit PNG or .npy"
+_TEXT = "np.save(name, np.loadtxt(path)), with delimiter=',' for commas"
+_PYTHON = "np.save(name, array) in the program that wrote it"
 UNREAD = {
     ".jpg": "JPEG loses what is measured: export 16-bit PNG, TIFF or .npy",
     ".exr": "np.save(name, cv2.imread(path, cv2.IMREAD_UNCHANGED)), with OPENCV_IO_ENABLE_OPENEXR=1",
-    ".csv": "np.save(name, np.loadtxt(path, delimiter=','))",
-    ".zip": "unpack it first",
+    **dict.fromkeys((".csv", ".txt", ".asc", ".xyz"), _TEXT),
+    **dict.fromkeys((".pkl", ".pickle", ".pt", ".pth", ".zarr", ".zarray"), _PYTHON),
+    **dict.fromkeys((".zip", ".gz", ".7z", ".tar", ".xz", ".bz2"), "unpack it first"),
+    **dict.fromkeys((".zst", ".zstd"), "unpack it first: zstd -d FILE"),
+    ".dat": "call it .raw, and say --shape H,W",
+    ".active": "a recorder was killed: rosbag reindex FILE, then call it .bag",
     ".avi": _VIDEO,
     ".mkv": _VIDEO,
     ".mp4": _VIDEO,
     ".parquet": "tables of LeRobot and Hugging Face hold no raw frames: export images or .npy",
 }
-UNREAD |= {".jpeg": UNREAD[".jpg"], ".gz": UNREAD[".zip"], ".7z": UNREAD[".zip"], ".tar": UNREAD[".zip"]}
+UNREAD[".jpeg"] = UNREAD[".jpg"]
 """What to do with files of measurements that no reader reads."""
 
 
@@ -110,12 +116,20 @@ def _expect_read(passed: list[Path], said: Said, source: Path) -> None:
     poses = Path(str(said.poses.get("file", ""))).name
     left = [p for p in passed if p.suffix.lower() in UNREAD and p.name != poses]
     left = [p for p in left if re.search(r"depth|raw|truth|cloud|phase|taps|dcs", p.stem, re.IGNORECASE)]
+    left = [p for p in left if UNREAD[p.suffix.lower()] != _TEXT or _is_table(p)]
     if left:
         raise DataError(
             f"{source}: expected files that can be read, got {left[0].name}"
             + (f" and {len(left) - 1} more" if len(left) > 1 else ""),
             hint=f'{UNREAD[left[0].suffix.lower()]}; or move them away; or [truth] kind = "none" in import.toml',
         )
+
+
+def _is_table(path: Path) -> bool:
+    """Tell whether a text is an image or a cloud: many lines of many numbers; notes, stamps and intrinsics are not."""
+    with path.open(errors="replace") as file:
+        rows = [re.split(r"[,;\s]+", line.strip()) for line, _ in zip(file, range(40), strict=False)]
+    return len(rows) > 30 and (len(rows[-1]) > 17 or path.suffix.lower() in {".xyz", ".asc"})
 
 
 def _paths(source: Path, readers: list[Reader]) -> Iterator[Path]:

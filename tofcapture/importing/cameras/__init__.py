@@ -1,7 +1,7 @@
 """Read cameras from one line, or from the files of other tools, in our conventions.
 
 Read are Kalibr's camchain, ROS's CameraInfo (YAML or echoed), OpenCV's FileStorage (YAML, XML, JSON) and NPZ, COLMAP's
-``cameras.txt`` and ``cameras.bin``, Open3D's and nerfstudio's JSON, BOP's ``camera.json`` and ``scene_camera.json``, our TOML.
+``cameras.txt`` and ``cameras.bin``, Open3D's, RealSense's and nerfstudio's JSON, a matrix of NumPy's, BOP's ``camera.json`` and ``scene_camera.json``, our TOML.
 ``FILE#NAME`` names one camera of several. Lenses of other models are refused, or, where it is exact, written as OpenCV's.
 """
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tofcapture.camera import LENS_NAMES
 from tofcapture.errors import ConfigError, DataError, FormatError
 from tofcapture.importing.cameras.trees import read_tree
+from tofcapture.importing.readers.arrays import arrays_of
 from tofcapture.poses import Float64, check_transform, invert
 
 ORDER = ("fx", "fy", "cx", "cy")
@@ -34,7 +35,7 @@ LENS = [
 ]  # fmt: skip
 _SAME = [
     "plumb_bob", "radtan", "rational_polynomial", "opencv", "full_opencv", "pinhole", "simple_pinhole",
-    "simple_radial", "radial", "perspective", "brown", "none",
+    "simple_radial", "radial", "perspective", "brown", "none", "brown_conrady", "distortion.brown_conrady",
 ]  # fmt: skip
 _FISHEYE = ["equidistant", "equi", "fisheye", "kannala_brandt", "opencv_fisheye"]
 # COLMAP's models by number: name, and what its parameters are.
@@ -45,6 +46,7 @@ _COLMAP = {
     7: ("FOV", ""), 8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"), 9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
     10: ("THIN_PRISM_FISHEYE", ""),
 }  # fmt: skip
+_REALSENSE = {"ppx": "cx", "ppy": "cy"}
 _STEPS = 400  # of the radius, where a fisheye is fitted
 _FITTED = 0.02  # px, at most, that the fit may be off
 
@@ -128,6 +130,10 @@ def cameras_of(path: Path) -> dict[str, Found]:
     if path.suffix.lower() == ".npz":
         with np.load(path, allow_pickle=False) as held:
             tree: Any = {name: held[name] for name in held.files}
+    elif path.suffix.lower() == ".mat":
+        tree = arrays_of(path)
+    elif (matrix := _matrix_of(path)) is not None:
+        tree = {"k": matrix}
     elif path.suffix.lower() == ".txt":
         return dict(_colmap_txt(path))
     else:
@@ -143,9 +149,24 @@ def cameras_of(path: Path) -> dict[str, Found]:
     return found
 
 
+def _matrix_of(path: Path) -> NDArray[np.float64] | None:
+    """Read the camera matrix (3, 3) alone, as NumPy saves it: .npy, or lines of three numbers; ``None`` for anything else."""
+    if path.suffix.lower() not in {".npy", ".txt", ".csv"} or not path.stat().st_size:
+        return None
+    try:
+        if path.suffix.lower() == ".npy":
+            found = np.load(path, allow_pickle=False)
+        else:
+            found = np.loadtxt(path, delimiter="," if path.suffix.lower() == ".csv" else None)
+    except (ValueError, OSError, UnicodeDecodeError):
+        return None
+    return np.asarray(found, np.float64) if found.shape == (3, 3) else None
+
+
 def _cameras(tree: Mapping[Any, Any], path: Path) -> Iterator[tuple[str, Found]]:
     """List the cameras of a file's dictionary: itself, those numbered in its names, or those below its names."""
-    low = {str(k).lower(): v for k, v in tree.items()}
+    low = {str(k).lower().removeprefix("camera."): v for k, v in tree.items()}  # ORB-SLAM's names
+    low = {_REALSENSE.get(k, k): v for k, v in low.items()}
     chain = np.eye(4)
     if (own := camera_of_table(low, f"{path}")) is not None:
         yield "camera", Found(own)

@@ -29,7 +29,8 @@ def read_tree(path: Path) -> Any:
             return json.loads(text)
         return parsed_xml(text, path) if text[:1] == "<" else yaml_tree(text, path)
     except (ValueError, ET.ParseError) as err:
-        raise FormatError(f"{path}: expected JSON, TOML, YAML or XML, got {str(err)[:200]}") from err
+        hint = "is it this file? a camera can be told in numbers: --camera fx,fy,cx,cy[,k1,k2,p1,p2,k3]"
+        raise FormatError(f"{path}: expected JSON, TOML, YAML or XML, got {str(err)[:200]}", hint) from err
 
 
 def decoded(data: bytes) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 import zipfile
 import zlib
@@ -39,7 +40,27 @@ def pieces(path: Path, said: Said) -> Iterator[Piece]:
     facts = facts_of(held, path)
     for name, array in held.items():
         if name not in CHANNELS and array.ndim >= 2 and max(array.shape) > 4:
-            yield Piece(name if len(held) > 1 else "", path, partial(load_array, path, name), facts=facts)
+            own = facts.over(Facts(unit=_unit(path, name)))
+            yield Piece(name if len(held) > 1 else "", path, partial(load_array, path, name), facts=own)
+
+
+def _unit(path: Path, name: str) -> str:
+    """Read the unit of length that an HDF5 dataset's attribute says; empty for any other."""
+    if _KINDS[path.suffix.lower()] != "HDF5":
+        return ""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        told = next((file[name].attrs[k] for k in ("units", "unit") if k in file[name].attrs), "")
+    word = told.decode() if isinstance(told, bytes) else str(told)
+    return next(
+        (
+            u
+            for u, begin in (("mm", "mm|milli"), ("cm", "cm|centi"), ("m", "m$|met"))
+            if re.match(begin, word.lower())
+        ),
+        "",
+    )
 
 
 def facts_of(held: Mapping[str, NDArray[Any]], path: Path) -> Facts:

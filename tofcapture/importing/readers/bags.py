@@ -107,7 +107,8 @@ def pieces(path: Path, said: Said) -> Iterator[Piece]:
             hint="--camera fx,fy,cx,cy[,k1,k2,p1,p2,k3], or --camera FILE; record the camera_info topic with the images",
         )
     K = len(said.channels(Facts())[0])
-    turns = K if len(raw) == 1 and _alternates(bag, raw[0], K, camera) else 1
+    size = said.size(Facts(camera=camera))
+    turns = K if len(raw) == 1 and _alternates(bag, raw[0], K, size) else 1
     rows = _frames(bag, raw, truth, turns, said)
     facts, T_tof_truth = Facts(camera=camera, axes="KHW"), None
     known = _truth_facts(bag, truth) if truth else Facts()
@@ -117,7 +118,7 @@ def pieces(path: Path, said: Said) -> Iterator[Piece]:
         T_tof_truth = _between(bag, frame, bag.topics[truth].frame, rows[0][0], said)
     file = _file(path)
     for i, (time, held, target) in enumerate(rows):
-        pose, load = _between(bag, "", frame, time, said), partial(_stacked, path, held, K, camera)
+        pose, load = _between(bag, "", frame, time, said), partial(_stacked, path, held, K, size)
         joints = None if pose is None else _joints(bag, time, said)
         yield Piece(f"{raw[0]}/view{i:06d}", file, load, "raw", time, facts, pose, joints)
         if truth and target is not None:
@@ -284,10 +285,11 @@ def _camera(bag: _Bag, topic: str) -> Camera | None:
     return None
 
 
-def _alternates(bag: _Bag, topic: str, K: int, camera: Camera | None) -> bool:
-    """Whether channels come message by message."""
+def _alternates(bag: _Bag, topic: str, K: int, size: tuple[int, int] | None) -> bool:
+    """Whether channels come message by message; else one image has all below each other, and is tall."""
     first = _message(bag.path, topic, bag.topics[topic].received[0])
-    return K > 1 and first.ndim == 2 and (camera is None or first.shape[0] < K * camera.height)
+    tall = K * size[0] if size else 2 * max(first.shape[1:])
+    return K > 1 and first.ndim == 2 and first.shape[0] < tall
 
 
 def _frames(
@@ -370,14 +372,16 @@ def _messages(path: Path, held: Sequence[tuple[str, int]]) -> list[NDArray[Any]]
     return [found[one] for one in held]
 
 
-def _stacked(path: Path, held: Sequence[tuple[str, int]], K: int, camera: Camera | None) -> NDArray[Any]:
+def _stacked(
+    path: Path, held: Sequence[tuple[str, int]], K: int, size: tuple[int, int] | None
+) -> NDArray[Any]:
     """Read the channels (K, H, W) of a frame, from one image or from several."""
     images = _messages(path, held)
     if len({i.shape for i in images}) > 1:
         raise DataError(f"{path}: expected images of one size, got {', '.join(str(i.shape) for i in images)}")
     one = np.stack(images) if len(images) > 1 else images[0]
     if one.ndim == 2:
-        n = K if camera is None or one.shape[0] == K * camera.height else 1
+        n = K if size is None or one.shape[0] == K * size[0] else 1
         return one.reshape(n, -1, one.shape[1]) if one.shape[0] % n == 0 else one[None]
     if len(images) > 1 and one.ndim == 4:  # several topics of several channels
         return np.moveaxis(one, -1, 1).reshape(-1, *one.shape[1:3])

@@ -18,6 +18,7 @@ from tofcapture.importing.source import Piece
 
 IMAGES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".bmp")
 BINARY = (".raw", ".bin")
+_FLOATS = 0.99  # of the pixels, that have sizes of a measurement
 
 
 def claims(path: Path) -> bool:
@@ -43,7 +44,7 @@ def _decoded(path: Path, layout: str, shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def read_image(path: Path) -> NDArray[Any]:
-    """Read one grey image (H, W), or the pages of a TIFF (N, H, W).
+    """Read one grey image (H, W), or the pages of a TIFF (N, H, W), or its samples (H, W, N).
 
     Raises :class:`FormatError` for anything else, :class:`ConfigError` without OpenCV.
     """
@@ -54,26 +55,54 @@ def read_image(path: Path) -> NDArray[Any]:
             f"{path}: reading images needs OpenCV",
             hint="pip install opencv-python-headless, or convert to .npy",
         ) from err
-    if path.suffix.lower() in {".tif", ".tiff"}:
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what cannot be read is told below
+    tiff = path.suffix.lower() in {".tif", ".tiff"}
+    if tiff:
         pages = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)[1]
     else:
         pages = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED)]
-    if not pages or pages[0] is None:
+    found = [np.asarray(p) for p in pages if p is not None]
+    coloured = any(p.ndim == 3 and (p[..., :1] != p[..., :3]).any() for p in found)
+    if tiff and (coloured or not found):
+        whole = _tiff(path)
+        coloured, found = whole.ndim == 3 and whole.shape[-1] in (3, 4), [whole]
+    if not found:
         raise FormatError(f"{path}: expected an image", hint="copy it again")
-    if any(p.ndim == 3 and (p[..., :1] != p[..., :3]).any() for p in pages):
+    if coloured:
         raise FormatError(
             f"{path}: expected one channel of grey, got colours",
             hint="a coloured picture of a depth is no measurement; export 16-bit grey, or name other files in import.toml",
         )
-    grey = [np.asarray(p[..., 0] if p.ndim == 3 else p) for p in pages]
+    grey = [p[..., 0] if p.ndim == 3 and p.shape[-1] in (3, 4) else p for p in found]
     return grey[0] if len(grey) == 1 else np.stack(grey)
+
+
+def _tiff(path: Path) -> NDArray[Any]:
+    """Read what OpenCV does not: more samples than colours have, other compressions."""
+    try:
+        import tifffile
+
+        return np.asarray(tifffile.imread(path))
+    except (ImportError, ValueError, OSError, KeyError) as err:
+        hint = "pip install tifffile imagecodecs, or np.save(name, tifffile.imread(path)); or copy it again"
+        raise FormatError(f"{path}: expected a TIFF of grey pages that OpenCV reads: {err}", hint) from err
+
+
+def _are_floats(data: bytes, kind: str, pixels: int) -> bool:
+    """Tell whether bytes are floats of depths or counts: pairs of 16-bit counts have exponents that no measurement has."""
+    if len(data) % (pixels * 4):
+        return False
+    size = np.abs(np.frombuffer(data, kind))
+    size = size[np.isfinite(size) & (size > 0)]
+    return bool(size.size and ((size > 1e-4) & (size < 1e6)).mean() > _FLOATS)
 
 
 def read_words(path: Path, shape: tuple[int, ...], dtype: str = "") -> NDArray[Any]:
     """Read words (n, H, W) of a file that does not say its size.
 
     ``shape`` ends with H and W; a longer one is that of the array. ``dtype`` is NumPy's, such as ``>u2``; without one words have
-    16 bits, and their byte order is the one in which neighbours are alike. Raises :class:`FormatError`: sizes that do not fit.
+    16 bits, or 32 where these are floats, and their byte order is the one in which neighbours are alike. Raises
+    :class:`FormatError`: sizes that do not fit.
     """
     if len(shape) < 2 or min(shape, default=0) < 1:
         raise FormatError(
@@ -93,8 +122,12 @@ def read_words(path: Path, shape: tuple[int, ...], dtype: str = "") -> NDArray[A
             f"{path}: expected a multiple of {rows} x {columns} {8 * kind.itemsize}-bit words, got {size:g}",
             hint=f"rows of metadata count: {size / columns:g} rows of {columns} in all",
         )
+    if not dtype and (
+        floats := next((k for k in ("<f4", ">f4") if _are_floats(data, k, rows * columns)), "")
+    ):
+        kind = np.dtype(floats)
     images = np.frombuffer(data, dtype=kind).reshape(-1, rows, columns)
-    if not dtype:
+    if not dtype and kind.kind == "u":
         images = min((images, images.byteswap()), key=roughness)
     out = images.astype(kind.newbyteorder("="))
     return out.reshape(shape) if len(shape) > 2 and out.size == np.prod(shape) else out

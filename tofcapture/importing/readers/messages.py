@@ -6,7 +6,7 @@ import base64
 import json
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
@@ -33,7 +33,7 @@ _NAMED = {
 }
 _FOXGLOVE = {
     "RawImage": "Image", "CompressedImage": "CompressedImage", "CameraCalibration": "CameraInfo", "FrameTransform": "TFMessage",
-    "PoseInFrame": "PoseStamped",
+    "FrameTransforms": "TFMessage", "PoseInFrame": "PoseStamped",
 }  # fmt: skip
 POSES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
 _FROM_BASE = (
@@ -63,8 +63,8 @@ def opened(path: Path) -> Iterator[Any]:
         raise ConfigError(
             f"{path}: reading bags needs rosbags: {err}", hint="pip install 'tofcapture[bags]'"
         ) from err
-    if path.suffix == ".mcap" and _is_json(path):
-        yield lambda topics=(), start=None, stop=None: _json_messages(path, topics, start, stop)
+    if path.suffix.lower() == ".mcap":
+        yield _of_mcap(path)
         return
     try:
         with AnyReader([path], default_typestore=_types()) as bag:
@@ -90,7 +90,8 @@ def _types() -> Any:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def _is_json(path: Path) -> bool:
+def _of_mcap(path: Path) -> Callable[..., Iterator[Message]]:
+    """Read one MCAP file, of ROS 1 or 2 or of Foxglove's messages in JSON or protobuf; returns what lists its messages."""
     from mcap.exceptions import McapError
     from mcap.reader import make_reader
 
@@ -101,28 +102,88 @@ def _is_json(path: Path) -> bool:
         raise FormatError(
             f"{path}: cannot read the MCAP file: {err or type(err).__name__}", hint=_DAMAGED
         ) from err
-    kinds = {c.message_encoding for c in summary.channels.values()} if summary else set()
-    if kinds - {"json", "cdr", "ros1"}:
+    links = summary.channels.values() if summary else ()
+    if other := sorted({c.message_encoding for c in links} - {"json", "protobuf", "cdr", "ros1"}):
         raise FormatError(
-            f"{path}: expected messages of ROS or JSON, got {', '.join(sorted(kinds))}",
-            hint="mcap convert, or record with ros2 bag",
+            f"{path}: expected messages of ROS, or of Foxglove in JSON or protobuf, got {', '.join(other)}",
+            hint="record with ros2 bag, or write them with the SDK of Foxglove",
         )
-    return "json" in kinds
+    read: dict[int, tuple[str, Callable[[bytes], Any]]] = {}
+
+    def messages(topics: Any = (), start: int | None = None, stop: int | None = None) -> Iterator[Message]:
+        try:
+            with path.open("rb") as file:
+                for schema, c, m in make_reader(file).iter_messages(list(topics) or None, start, stop):
+                    if c.id not in read:
+                        read[c.id] = _reader_of(c.message_encoding, schema, path)
+                    kind, load = read[c.id]
+                    yield c.topic, kind, m.log_time, partial(load, m.data)
+        except (McapError, struct.error, EOFError) as err:
+            raise FormatError(f"{path}: cannot read the MCAP file: {err}", hint=_DAMAGED) from err
+
+    return messages
 
 
-def _json_messages(path: Path, topics: Any, start: int | None, stop: int | None) -> Iterator[Message]:
-    from mcap.reader import make_reader
+def _reader_of(encoding: str, schema: Any, path: Path) -> tuple[str, Callable[[bytes], Any]]:
+    """Return a type without its package and what reads a message of it: of ROS by its own definition, else of Foxglove."""
+    name = schema.name if schema else ""
+    if encoding in {"json", "protobuf"}:
+        kind = _FOXGLOVE.get(name.split(".")[-1], name)
+        known = kind != name and encoding == "protobuf"
+        table = _protobuf(schema.data, name, path) if known else json.loads
+        return kind, lambda data: _foxglove(table(data), kind)
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-    with path.open("rb") as file:
-        for schema, channel, m in make_reader(file).iter_messages(list(topics) or None, start, stop):
-            kind = _FOXGLOVE.get(schema.name.split(".")[-1], "") if schema else ""
-            yield channel.topic, kind, m.log_time, partial(_foxglove, m.data, kind)
+    name, text = (
+        name if "/msg/" in name else name.replace("/", "/msg/"),
+        schema.data.decode() if schema else "",
+    )
+    types = get_typestore(Stores.EMPTY) if text else _types()
+    if schema and schema.encoding == "ros2idl":
+        for part in re.split(r"^=+\nIDL: .*$", text, flags=re.MULTILINE):
+            types.register(get_types_from_idl(part) if part.strip() else {})
+    elif text:
+        types.register(get_types_from_msg(text, name))
+    read = types.deserialize_ros1 if encoding == "ros1" else types.deserialize_cdr
+    return name.split("/")[-1], lambda data: read(data, name)
 
 
-def _foxglove(data: bytes, kind: str) -> Any:
+def _protobuf(definition: bytes, name: str, path: Path) -> Callable[[bytes], dict[str, Any]]:
+    """Return what reads messages of protobuf as dictionaries, by the definition that the file holds of them."""
+    try:
+        from google.protobuf.descriptor_pb2 import FileDescriptorSet
+        from google.protobuf.descriptor_pool import DescriptorPool
+        from google.protobuf.message import DecodeError
+        from google.protobuf.message_factory import GetMessageClass
+    except ImportError as err:
+        raise ConfigError(f"{path}: reading protobuf needs it: {err}", hint="pip install protobuf") from err
+    pool = DescriptorPool()
+    try:
+        for one in FileDescriptorSet.FromString(definition).file:
+            pool.Add(one)
+        kind = GetMessageClass(pool.FindMessageTypeByName(name))
+    except (DecodeError, KeyError, TypeError) as err:
+        raise FormatError(f"{path}: the schema of {name} cannot be read: {err}", hint=_DAMAGED) from err
+
+    def table(message: Any) -> dict[str, Any]:
+        found = {f.name: getattr(message, f.name) for f in message.DESCRIPTOR.fields}
+        return {k: _plain(v) for k, v in found.items()}
+
+    def _plain(value: Any) -> Any:
+        if hasattr(value, "DESCRIPTOR"):
+            return table(value)
+        return value if isinstance(value, str | bytes | int | float) else [_plain(v) for v in value]
+
+    return lambda data: table(kind.FromString(data))
+
+
+def _foxglove(told: Mapping[str, Any], kind: str) -> Any:
     """Give a message of Foxglove's the names that ROS's has."""
-    told: dict[str, Any] = json.loads(data)
-    stamp = SimpleNamespace(sec=told["timestamp"]["sec"], nanosec=told["timestamp"]["nsec"])
+    if "transforms" in told:
+        return SimpleNamespace(transforms=[_foxglove(t, kind).transforms[0] for t in told["transforms"]])
+    time = told["timestamp"]
+    nanoseconds = next((int(time[k]) for k in ("nsec", "nanos", "nanosec") if k in time), 0)
+    stamp = SimpleNamespace(sec=int(time.get("sec", time.get("seconds", 0))), nanosec=nanoseconds)
     header = SimpleNamespace(stamp=stamp, frame_id=told.get("frame_id", told.get("parent_frame_id", "")))
     if kind == "TFMessage":
         move, turn = (SimpleNamespace(**told[k]) for k in ("translation", "rotation"))
@@ -133,7 +194,8 @@ def _foxglove(data: bytes, kind: str) -> Any:
         pose = SimpleNamespace(**{k: SimpleNamespace(**told["pose"][k]) for k in ("position", "orientation")})
         return SimpleNamespace(header=header, pose=pose)
     rest = {k: v for k, v in told.items() if k not in {"timestamp", "frame_id", "data"}}
-    values = np.frombuffer(base64.b64decode(told["data"]), np.uint8) if "data" in told else None
+    values = told.get("data", b"")
+    values = np.frombuffer(values if isinstance(values, bytes) else base64.b64decode(values), np.uint8)
     return SimpleNamespace(header=header, data=values, is_bigendian=0, **rest)
 
 
@@ -222,10 +284,10 @@ def camera_of(message: Any, where: str, *, rectified: bool) -> Camera:
     told = {str(k).lower(): v for k, v in vars(message).items()} if hasattr(message, "__dict__") else {}
     if not told:
         told = {n.lower(): getattr(message, n) for n in getattr(message, "__slots__", ())}
-    P = np.asarray(told["p"]).reshape(3, 4)
+    P = np.reshape(told["p"] if np.size(told["p"]) == 12 else np.zeros(12), (3, 4))
     if rectified and P[0, 0]:
         told |= {"k": P[:, :3].ravel(), "d": [], "distortion_model": ""}
-    if not np.asarray(told["k"])[0]:
+    if not np.any(np.ravel(told["k"])[:1]):
         raise DataError(
             f"{where}: expected a calibrated camera, got a CameraInfo of zeros",
             hint="--camera fx,fy,cx,cy[,k1,k2,p1,p2,k3]",
