@@ -81,6 +81,13 @@ def test_large_images_of_tags_hold_no_stray_corner(roll):
     assert np.abs(pixels - true).max() < 0.2
 
 
+@pytest.mark.parametrize("name", BOARDS)
+def test_an_image_without_a_board_is_refused(name):
+    """It is said how many corners there are."""
+    with pytest.raises(QualityError, match="at least 6 corners, got 0"):
+        corners_in(np.full((180, 240), 90.0), load_board(name).pattern)
+
+
 def plate_before_a_wall(board, camera, T, noise=0.0002):
     """Stereo frame of a plate at ``T_camera_board`` before a larger one 6 cm behind, and a wall."""
     rays = camera.rays.astype(np.float64)

@@ -126,7 +126,9 @@ def test_a_rig_needs_only_its_tof_camera_to_predict_and_names_all_that_is_missin
         )
         == 0
     )
-    assert "240 x 180" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "240 x 180" in said
+    assert "64.4 x 48.3" in said  # deg, by width and height over twice the focal lengths
     assert load_rig(rig).tof.distortion[0] == -0.1
     alone = tmp_path / "alone.toml"
     alone.write_text("[tof]\nwidth = 240\nheight = 180\nfx = 190.0\nfy = 200.0\ncx = 117.0\ncy = 101.0\n")

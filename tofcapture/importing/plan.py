@@ -162,7 +162,7 @@ def plan(source: Path, said: Said) -> list[Planned]:
         channels, size = len(said.channels(facts)[0]), said.size(facts)
         views = _views(found, truth.get(scene, []), said, channels, size, source)
         out += [replace(v, scene=check_scene_name(scene), index=i) for i, v in enumerate(views)]
-    return _posed(out, [n.piece for n in named if n.role == "pose"], said, source)
+    return _posed(out, said, source)
 
 
 def _expect_alike(pieces: list[Piece], source: Path) -> None:
@@ -191,16 +191,12 @@ def _tell_unnamed(names: list[str], source: Path) -> None:
         warnings.warn(f'{text}; [truth] files = "..." in import.toml takes them', PassedOver, stacklevel=2)
 
 
-def _posed(views: list[Planned], pieces: list[Piece], said: Said, source: Path) -> list[Planned]:
-    """Give views the poses that ``[poses] file`` or the source itself has."""
+def _posed(views: list[Planned], said: Said, source: Path) -> list[Planned]:
+    """Give views the poses that ``[poses] file`` has."""
     path = (source if source.is_dir() else source.parent) / str(said.poses.get("file", ""))
     if said.poses.get("file") and (path.is_file() or not all(v.T_world_tof is not None for v in views)):
         stamps, poses = read_poses(path, said)
         where = str(path)
-    elif pieces and all(p.T is not None for p in pieces):
-        poses, where = np.stack([p.T for p in pieces if p.T is not None]), pieces[0].name
-        known = [p.time_ns for p in pieces if p.time_ns is not None]
-        stamps = np.array(known) * 1e-9 if len(known) == len(pieces) else None
     else:
         return views
     found = poses_of([v.time_ns for v in views], stamps, poses, said, where)

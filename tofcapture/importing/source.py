@@ -24,7 +24,7 @@ from tofcapture.errors import DataError
 from tofcapture.importing.said import Facts, Said
 from tofcapture.poses import Float64
 
-Role = Literal["", "raw", "truth", "pose", "other"]
+Role = Literal["", "raw", "truth", "other"]
 READERS = ("bags", "bop", "arrays", "images", "clouds")
 """Modules of :mod:`tofcapture.importing.readers`, asked in this order; the first that claims a path reads it."""
 _VIDEO = "a video loses what is measured: export frames as 16-bit PNG or .npy"
@@ -58,7 +58,7 @@ class Piece:
     role: Role = ""  #: What it is, where the reader knows; else its name tells.
     time_ns: int | None = None  #: Its stamp.
     facts: Facts = field(default_factory=Facts)  #: What the file knows of it.
-    #: (4, 4) pose of the camera in the world, of a ``raw`` or ``pose``; (4, 4) to the ToF camera, of a ``truth``.
+    #: (4, 4) pose of the camera in the world, of a ``raw``; (4, 4) to the ToF camera, of a ``truth``.
     T: Float64 | None = None
     joints: Float64 | None = None  #: (6,) angles of the arm that held the camera.
 
