@@ -373,11 +373,14 @@ def test_lerobot_rows_are_the_views(dataset, tmp_path):
 
 
 def test_lerobot_reads_it(dataset, tmp_path):
-    """LeRobot's own reader gives depth in the millimetres that it answers by default, and the task."""
+    """LeRobot's own reader gives depth as it is stored, in metres, or since 0.6 in millimetres by default, and the task."""
     lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot is not installed")
     export(dataset, "lerobot", tmp_path)
     read = lerobot.LeRobotDataset("local/tof", root=tmp_path)
     with ShardReader(dataset / "shards/mug.h5") as shard:
         depth = np.nan_to_num(shard.tof(1).depth)
     assert (len(read), read[3]["task"]) == (6, "mug")
-    np.testing.assert_allclose(read[3]["observation.depth.tof"].numpy()[0], 1000 * depth, rtol=1e-6)
+    found = read[3]["observation.depth.tof"].numpy()[0]
+    unit = round(float(np.median(found[depth > 0] / depth[depth > 0])))
+    assert unit in {1, 1000}
+    np.testing.assert_allclose(found, unit * depth, rtol=1e-6)

@@ -428,6 +428,7 @@ FIELD = {  # as tools of the field name and keep their files
     "stamps of a camera's recorder": lambda i: (f"Phase{{k}}_{1700000000123.456 + 33.3 * i:.12f}.png", f"Depth_{1700000000123.456 + 33.3 * i:.12f}.png"),
     "a stamp for each image": lambda i: (f"Phase{{k}}_{{{1700000000123 + 1000 * i} + 3 * k}}.png", f"Depth_{1700000000123 + 1000 * i}.png"),
     "a running number": lambda i: (f"frame_{{{8 * i} + k:06d}}.png", f"depth_{8 * i:06d}.png"),
+    "a running number, depths by frame": lambda i: (f"frame_{{{8 * i} + k:06d}}.png", f"depth_{i}.png"),
     "frequency and phase": lambda i: (f"img{i:03d}_{{20 + 80 * (k // 4)}}MHz_{{90 * (k % 4)}}deg.png", f"img{i:03d}_depth.png"),
     "one tall image": lambda i: (f"raw_{i:04d}.png", f"depth_{i:04d}.png"),
 }  # fmt: skip

@@ -54,7 +54,7 @@ def calibration_views(recording: Path) -> list[Path]:
     if not found:
         raise DataError(
             f"{recording}: expected a recording with views of the board in {folder}, got {what_is(recording)}",
-            hint=f"tofcapture record --calibration --out {recording}",
+            hint=f"tofcapture record --calibration --out {recording}; of imported data: tofcapture import BOARD --scene calibration --out {recording}",
         )
     return found
 

@@ -169,7 +169,13 @@ def _run(args: argparse.Namespace) -> Outcome:
     lines += [f"{args.out}: {counted(len(result.scenes), 'scene')}, {counted(views, 'view')}"]
     if result.skipped:
         lines.append(f"{counted(len(result.skipped), 'scene')} already imported")
-    return Outcome(data, "\n".join(lines), following=f"tofcapture build-dataset {args.out} --out dataset")
+    unplaced = f"tofcapture align {args.out} --initial none"
+    following = (
+        unplaced
+        if any(text.endswith(unplaced) for text in result.warnings)
+        else f"tofcapture build-dataset {args.out} --out dataset"
+    )
+    return Outcome(data, "\n".join(lines), following=following)
 
 
 _CAMERA = "fx,fy,cx,cy[,k1,k2,p1,p2,k3], or a file of Kalibr, ROS, OpenCV or COLMAP"

@@ -516,7 +516,9 @@ def _paired(groups: Mapping[Key, Any], truth: list[_Named], source: Path) -> lis
         if len(known) == len(truth) and set(groups) <= set(known):
             return [known[k] for k in groups]
     if len(truth) == len(groups):
-        _expect_one_step(list(groups), [tuple(v for _, v in n.numbers) for n in truth], source)
+        keys_of_truth = [tuple(v for _, v in n.numbers) for n in truth]
+        if not _is_running(groups):
+            _expect_one_step(list(groups), keys_of_truth, source)
         return [n.piece for n in truth]
     missing = [".".join(map(str, k)) for k in groups if k not in short and k not in keys]
     raise DataError(
@@ -524,6 +526,13 @@ def _paired(groups: Mapping[Key, Any], truth: list[_Named], source: Path) -> lis
         + (f"; there is none for {_some(missing)}" if missing else ""),
         hint='copy the missing files, or import without ground truth: [truth] kind = "none" in import.toml',
     )
+
+
+def _is_running(groups: Mapping[Key, list[Piece]]) -> bool:
+    """Whether one number counts all images of all frames; the first of a frame says nothing of its partner then."""
+    names = [Path(p.name).stem for pieces in groups.values() for p in pieces]
+    found = sorted(int((re.findall(r"\d+", n) or ["0"])[-1]) for n in names)
+    return len(found) > len(groups) and found == list(range(found[0], found[0] + len(found)))
 
 
 def _expect_one_step(raw: list[Key], truth: list[Key], source: Path) -> None:
