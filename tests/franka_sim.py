@@ -1,15 +1,18 @@
 """franky-sim, a simulated Franka Research 3 that speaks the robot's own protocol, in a process of its own.
 
-Run as a module it serves the address of its first argument, obeys lines on its standard input (``mode NAME``, ``report``, ``clear``),
-and answers ``report`` with what its joints did since ``clear``.
+Run as a module it serves the address of its first argument until its standard input closes. At the port that the UR emulator has for it,
+too, it obeys lines: ``mode NAME``, ``clear``, ``report`` (answered with what its joints did since then), ``{"do": "status"}``.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import signal
+import socket
+import socketserver
 import subprocess
 import sys
 import threading
@@ -18,6 +21,7 @@ import time
 import numpy as np
 
 from tests.emulated import CAMERAS
+from tests.ur_emulator.__main__ import CONTROL
 
 # The simulator has a floor at the height of the base: the table stands on it.
 STATION = (
@@ -41,10 +45,9 @@ keep_out_height = 0.20
 home = [0.0, -0.785398, 0.0, -2.356194, 0.0, 1.570796, 0.785398]
 """
 )
-_GAINS = {
-    "kp": (2000.0, 2000.0, 1500.0, 1500.0, 400.0, 400.0, 100.0),
-    "kv": (200.0, 200.0, 150.0, 150.0, 20.0, 20.0, 5.0),
-}
+# Its own gains let the arm lag by 0.1 s and the wrist tremble at rest.
+_KP = np.array([4500.0, 4500.0, 3500.0, 3500.0, 1000.0, 1000.0, 400.0])
+_GAINS = {"kp": tuple(_KP), "kv": tuple(_KP / 40)}
 HOME = np.array([0.0, -0.785398, 0.0, -2.356194, 0.0, 1.570796, 0.785398])
 THERE = np.add(HOME, [0.4, 0.1, 0.0, 0.1, 0.0, 0.1, -0.2])
 
@@ -68,17 +71,21 @@ class FrankaSim:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )
         assert self._process.stdout.readline().strip() == "ready"
+        self._link = socket.create_connection((self.host, CONTROL))
+        self._lines = self._link.makefile("rw")
         return self
 
     def __exit__(self, *_):
+        self._lines.close()
+        self._link.close()
         self._process.kill()
-        self._process.wait()
+        self._process.communicate()
 
     def order(self, line):
         """Say a line; returns what is answered."""
-        self._process.stdin.write(line + "\n")
-        self._process.stdin.flush()
-        return json.loads(self._process.stdout.readline())
+        self._lines.write(line + "\n")
+        self._lines.flush()
+        return json.loads(self._lines.readline())
 
     def hang(self):
         """Make it silent, its connections open."""
@@ -105,31 +112,47 @@ def _serve(host):
         return found.replace(robot_mode=told["mode"]) if told else found
 
     FrankaRobotServer.robot_state = property(state)
-    seen = []
+    seen, socketserver.ThreadingTCPServer.allow_reuse_address = [], True
+
+    class Orders(socketserver.StreamRequestHandler):
+        def handle(self):
+            for line in self.rfile:
+                answer = _obeyed(line.decode(), told, seen, RobotMode)
+                self.wfile.write(json.dumps(answer).encode() + b"\n")
+
     with MujocoSimulator(enable_visualization=False) as sim:
-        robot = sim.add_robot(initial_q=HOME, **_GAINS)  # with its own the wrist trembles at rest
-        with SimulationServer(sim, [host]) as server:
-            threading.Thread(target=_obey, args=(told, seen, RobotMode), daemon=True).start()
+        robot = sim.add_robot(initial_q=HOME, **_GAINS)
+        with (
+            SimulationServer(sim, [host]) as server,
+            socketserver.ThreadingTCPServer((host, CONTROL), Orders) as orders,
+        ):
+            orders.daemon_threads = True
+            for work in (orders.serve_forever, _end_with_parent):
+                threading.Thread(target=work, daemon=True).start()
             print("ready", flush=True)
-            while True:
+            for tick in itertools.count():
                 server.run_once()
                 inner = robot.state
-                seen.append((time.monotonic(), *inner.q))
+                seen.append((time.monotonic(), 1e-3 * tick, *inner.q))
 
 
-def _obey(told, seen, modes):
-    for line in sys.stdin:
-        word, *rest = line.split()
-        answer = True
-        if word == "mode":
-            told.clear()
-            if rest[0] != "own":
-                told["mode"] = modes[rest[0]]
-        elif word == "clear":
-            seen.clear()
-        elif word == "report":
-            answer = [list(row) for row in list(seen)]
-        print(json.dumps(answer), flush=True)
+def _obeyed(line, told, seen, modes):
+    if "status" in line:
+        _, clock, *joints = seen[-1]
+        return {"clock": clock, "joints": joints}
+    word, *rest = line.split()
+    if word == "mode":
+        told.clear()
+        if rest[0] != "own":
+            told["mode"] = modes[rest[0]]
+    elif word == "clear":
+        del seen[:-1]
+    return [(t, *q) for t, _, *q in list(seen)] if word == "report" else True
+
+
+def _end_with_parent():
+    sys.stdin.read()
+    os._exit(0)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Stops at chosen moments around the start of a move, at every layer, on the emulated arm, and when it came to rest.
+"""Stops at chosen moments of a move, at every layer, on an arm that is emulated or simulated, and when it came to rest.
 
 ``python -m tests.stopping LAYER HOST STATION.toml MS ...`` makes the trials in a process of its own and prints them as JSON: the
 vendor's library, used directly, does not leave a process in peace.
@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from tests import PATIENCE
-from tests.emulated import THERE
+from tests import PATIENCE, emulated, franka_sim
 from tests.ur_emulator.__main__ import CONTROL
+from tofcapture.devices.arm.franka import FrankaArm
 from tofcapture.devices.kinematics import HOME
 from tofcapture.devices.registry import StationContext, make_device
 from tofcapture.devices.station import open_station, read_station
@@ -38,16 +38,22 @@ LAYERS = ("direct", "host", "station", "recorder", "daemon")
 HALTED = 0.3  # s within which the arm must be at rest
 _LEAD = 0.1  # s before the move in which stops may come
 _LOOK = 0.7  # s for which the arm is watched after the stop
+_STILL = 0.02  # rad/s
 _ROOT = Path(__file__).parents[1]
+# Their classes, where a move begins, and where it goes.
+_ARMS: dict[str, tuple[type, Any, Any]] = {
+    "ur_rtde": (UrArm, HOME, emulated.THERE),
+    "franka": (FrankaArm, franka_sim.HOME, franka_sim.THERE),
+}
 
 
 class Witness:
-    """Reads the emulated joints 200 times a second from a connection of its own."""
+    """Reads the arm's joints 200 times a second from a connection of its own, and its clock where it has one."""
 
     def __init__(self, host: str) -> None:
         self._link = socket.create_connection((host, CONTROL), PATIENCE)
         self._lines = self._link.makefile("rwb")
-        self.seen: list[tuple[float, list[float]]] = []
+        self.seen: list[tuple[float, float, list[float]]] = []
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._look)
         self._thread.start()
@@ -57,7 +63,8 @@ class Witness:
             self._lines.write(b'{"do": "status"}\n')
             self._lines.flush()
             status = json.loads(self._lines.readline())
-            self.seen.append((time.monotonic(), status["joints"]))
+            now = time.monotonic()
+            self.seen.append((now, status.get("clock", now), status["joints"]))
 
     def end(self) -> None:
         """Look no more."""
@@ -65,12 +72,15 @@ class Witness:
         self._thread.join()
         self._link.close()
 
-    def moved(self, since: float) -> tuple[float, float]:
-        """Seconds after ``since`` at which the arm moved last, and degrees that it turned in all."""
-        times, joints = np.array([t for t, _ in self.seen]), np.array([q for _, q in self.seen])
-        changed = np.abs(np.diff(joints, axis=0)).max(axis=1) > 1e-7
-        last = times[1:][changed].max(initial=since)
-        return float(last - since), float(np.degrees(np.ptp(joints, axis=0).max()))
+    def moved(self, since: float) -> tuple[float, float, float]:
+        """Seconds of ours and of the arm after ``since`` at which it moved last, and degrees that it turned from then on."""
+        times, clock = np.array([t for t, _, _ in self.seen]), np.array([c for _, c, _ in self.seen])
+        joints = np.array([q for _, _, q in self.seen])
+        fast = np.abs(np.diff(joints, axis=0)).max(axis=1) > _STILL * np.diff(clock)
+        last = int(np.flatnonzero(fast).max(initial=-1)) + 1
+        after = joints[max(int(np.searchsorted(times, since)) - 1, 0) :]
+        turned = float(np.degrees(np.ptp(after, axis=0).max()))
+        return max(times[last] - since, 0.0), max(clock[last] - np.interp(since, times, clock), 0.0), turned
 
 
 def _trial(host: str, delay: float, move: Callable[[], Any], stop: Callable[[], Any]) -> dict[str, Any]:
@@ -100,11 +110,12 @@ def _trial(host: str, delay: float, move: Callable[[], Any], stop: Callable[[], 
 def _judged(witness: Witness, delay: float, at: float, said: str) -> dict[str, Any]:
     time.sleep(max(0.0, at + _LOOK - time.monotonic()))
     witness.end()
-    seconds, turned = witness.moved(at)
+    seconds, arms, turned = witness.moved(at)
     return {
         "ms": round(1e3 * delay),
         "said": said,
         "rest_s": round(seconds, 3),
+        "arm_s": round(arms, 3),
         "turned_deg": round(turned, 2),
     }
 
@@ -126,20 +137,22 @@ def _arm(layer: str, file: Path) -> Iterator[Any]:
         return
     context = _context(file)
     table = {k: v for k, v in context.config["arm"].items() if k != "driver"}
-    with UrArm(table, context) if layer == "direct" else make_device("arm", context) as arm:
+    own = _ARMS[context.config["arm"]["driver"]][0]
+    with own(table, context) if layer == "direct" else make_device("arm", context) as arm:
         arm.equip(_rig())
         yield arm
 
 
 def by_arm(layer: str, host: str, file: Path, delays: list[float]) -> Iterator[dict[str, Any]]:
     """Stops at an arm: the driver itself, in its host, or as the station's."""
+    _, home, there = _ARMS[read_station(file)["arm"]["driver"]]
     with _arm(layer, file) as arm:
         for delay in delays:
-            arm.move_to(HOME)
-            trial = _trial(host, delay, lambda: arm.move_to(THERE), arm.stop)
+            arm.move_to(home)
+            trial = _trial(host, delay, lambda: arm.move_to(there), arm.stop)
             # It holds: also for the next move, whoever asks for it.
             with contextlib.suppress(MotionStopped):
-                arm.move_to(HOME)
+                arm.move_to(home)
                 trial["said"] = "moved after a stop"
             arm.resume()
             yield trial
@@ -169,10 +182,10 @@ class _Press(Observer):
 def by_recorder(host: str, file: Path, delays: list[float]) -> Iterator[dict[str, Any]]:
     """Stops at the arm while a recorder works."""
     with open_station(file, allow_motion=True) as station, tempfile.TemporaryDirectory() as folder:
-        plan = plan_scene(station, "mug", 1)
+        plan, home = plan_scene(station, "mug", 1), _ARMS[read_station(file)["arm"]["driver"]][1]
         recorder.plan_scene = lambda *_: plan  # type: ignore[assignment]  # planning is most of a short run
         for n, delay in enumerate(delays):
-            station.arm.move_to(HOME)
+            station.arm.move_to(home)
             press, said = _Press(host, delay, station.arm.stop), "recorded"
             try:
                 recorder.record(station, "mug", Path(folder) / str(n), 1, 1, observer=press)
@@ -259,8 +272,8 @@ def sweep(layer: str, host: str, file: Path, delays: list[float]) -> list[dict[s
 
 
 def faults_of(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Those in which the arm did not come to rest in time, or its stop was not said."""
-    return [t for t in trials if t["said"] != "stopped" or t["rest_s"] > HALTED]
+    """Those in which the arm did not come to rest in time, by its own clock, or its stop was not said."""
+    return [t for t in trials if t["said"] != "stopped" or t["arm_s"] > HALTED]
 
 
 def main() -> None:

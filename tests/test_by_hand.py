@@ -314,6 +314,32 @@ def test_poses_of_a_stream_are_recorded_and_judge():
     assert np.linalg.norm(after.T_base_flange[:3, 3] - before.T_base_flange[:3, 3]) < 2e-3
 
 
+@pytest.mark.slow
+def test_a_tracked_rig_is_recorded(tmp_path):
+    """The registered driver: a person overshoots, trembles and rests, at two places; their poses are in a recording that checks."""
+    path, out, rng = tmp_path / "station.toml", tmp_path / "rec", np.random.default_rng(2)
+    moved = []  # when the second place was made for
+
+    def pose(t):
+        if not moved and (out / "views/mug").is_dir() and find_views(out).get("mug"):
+            moved.append(t)
+        here, since = (0.4, t - moved[0]) if moved else (0.1, t)
+        swing = 0.3 * max(0.0, 1.5 - since) - 0.06 * np.sin(2 * np.pi * min(since, 1.5) / 1.5)
+        tremble = rng.normal(0, 0.01, 3) if 1.5 < since < 3.5 else np.zeros(3)
+        return np.array([here + swing, 0.1, 0.5]) + tremble
+
+    with _Tracker(pose) as tracker:
+        text = STATION.replace('"carried"\nhold', f'"manual"\nposes = "127.0.0.1:{tracker.port}"\nhold')
+        path.write_text(text.replace('"carried"', '"sim"'))
+        command = ["record", "--scene", "mug", "--views", "2", "--frames", "2", "--station", str(path)]
+        assert main([*command, "--out", str(out)]) == 0
+    assert main(["check", str(out)]) == 0
+    states = [open_view(p).arm_before for p in find_views(out)["mug"]]
+    places = [s.T_base_flange[:3, 3] for s in states]
+    np.testing.assert_allclose(places, [[0.1, 0.1, 0.5], [0.4, 0.1, 0.5]], atol=2e-3)
+    assert all(np.isnan(s.joints).all() for s in states)
+
+
 def test_the_contract_holds_with_a_stream():
     """The conformance suite passes on the driver as a station makes it."""
     with _Tracker(lambda t: (0.0, 0.0, 0.5)) as tracker:

@@ -88,13 +88,11 @@ def cells():
     return ["".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code"]
 
 
-def test_own_camera():
-    """The template of a driver keeps the contract, in at most sixty lines."""
-    script = EXAMPLES / "own_camera.py"
-    ran = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stderr
-    assert "keeps the contract" in ran.stdout
-    assert len(script.read_text().splitlines()) <= 60
+@pytest.mark.parametrize("script", ["own_camera.py", pytest.param("own_arm.py", marks=pytest.mark.slow)])
+def test_own_drivers(script):
+    """The templates of drivers keep the contract, in at most sixty lines."""
+    assert "keeps the contract" in run(script)
+    assert len((EXAMPLES / script).read_text().splitlines()) <= 60
 
 
 def test_the_notebook_is_one():

@@ -129,7 +129,7 @@ def test_the_contract_holds(sim, tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_stop_holds(sim, tmp_path):
-    """A stop in mid-move ends it within half a second of the arm's clock, near where it was, until somebody resumes."""
+    """A stop in mid-move ends it within 0.3 s of the arm's clock, ahead on its way, until somebody resumes."""
     with driver(tmp_path, sim.host) as arm:
         at_home(arm)
         sim.order("clear")
@@ -147,8 +147,10 @@ def test_a_stop_holds(sim, tmp_path):
         thread.join()
         ticks = np.array(sim.order("report"))[:, 1:]
         moving = np.abs(np.diff(ticks, axis=0)).max(axis=1) > 2e-5  # rad in a tick of 1 ms
-        assert np.flatnonzero(moving).max(initial=0) < 500
+        assert np.flatnonzero(moving).max(initial=0) < 300
         assert np.ptp(ticks, axis=0).max() < 0.25
+        along = (ticks - HOME) @ (THERE - HOME) / np.linalg.norm(THERE - HOME)
+        assert along.max() - along[-1] < 0.01  # it does not go back
         with pytest.raises(MotionStopped):
             arm.move_to(HOME)
         arm.resume()

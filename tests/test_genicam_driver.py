@@ -157,7 +157,7 @@ def test_faults_have_names_in_time(fake, tmp_path):
             stereo.capture()
     file = tmp_path / "genicam-Fake_1.toml"
     file.write_text(file.read_text().replace("fx = 560.0", "fx = 555.0"))
-    with pytest.raises(DeviceError, match="intrinsics are not those"), driver(tmp_path):
+    with pytest.raises(DeviceError, match="calibration is not the one"), driver(tmp_path):
         pass
     assert time.monotonic() - begun < SOON
 

@@ -27,7 +27,8 @@ class Emulated:
     """A D435 that sees a wall, as a software device of the library; in the dark without its projector."""
 
     def __init__(self, serial="8196"):
-        self.device, self.lit, self.silent, self._end = rs.software_device(), [], False, threading.Event()
+        self.device, self.lit, self._end = rs.software_device(), [], threading.Event()
+        self.silent = self.unplugged = False
         self.device.register_info(rs.camera_info.name, "RealSense D435")
         self.device.register_info(rs.camera_info.serial_number, serial)
         self.sensor = self.device.add_sensor("Stereo Module")
@@ -71,12 +72,12 @@ class Emulated:
 
 @pytest.fixture
 def camera(monkeypatch):
-    """Have the library find one emulated camera; its software devices are in no list of USB devices."""
+    """Have the library find one emulated camera while it is plugged in; its software devices are in no list of USB devices."""
     emulated = Emulated()
 
     class Context:
         def query_devices(self):
-            return [emulated.device]
+            return [] if emulated.unplugged else [emulated.device]
 
     monkeypatch.setattr(rs, "context", Context)
     yield emulated
@@ -155,6 +156,13 @@ def test_faults_have_names_in_time(camera, tmp_path):
         with pytest.raises(DeviceError, match="capturing with 8196"):
             stereo.capture()
         camera.silent = False
+        assert np.isfinite(stereo.capture().points).any()
+        camera.silent = camera.unplugged = True
+        with pytest.raises(DeviceError, match="capturing with 8196"):
+            stereo.capture()
+        with pytest.raises(DeviceError, match="no RealSense camera 8196; there are: none"):
+            stereo.capture()
+        camera.silent = camera.unplugged = False
         assert np.isfinite(stereo.capture().points).any()
     file = tmp_path / "realsense-8196.toml"
     file.write_text(file.read_text().replace("fx = 250.0", "fx = 255.0"))

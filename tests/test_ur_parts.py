@@ -20,7 +20,7 @@ from tests.ur_emulator.robot import PLAYING, Robot
 from tests.ur_emulator.rtde_server import pack
 from tests.ur_emulator.script import ControlScript
 from tofcapture.devices import faults
-from tofcapture.devices.arm.limits import check_goal, check_way, joint_speed
+from tofcapture.devices.arm.limits import Link, Sample, check_goal, check_way, follow, joint_speed, stopping
 from tofcapture.devices.clearance import body_of, workcell_of
 from tofcapture.devices.kinematics import HOME
 from tofcapture.devices.station import DEFAULT, open_station
@@ -180,6 +180,38 @@ def test_motion_is_a_trapezoid():
     assert motion.position == goal
     assert top == pytest.approx(0.5, rel=1e-6)
     assert seconds == pytest.approx(1.0 / 0.5 + 0.5 / 1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("speed", "rate"), [(0.7, 0.0), (0.05, 1.4), (0.5, -1.4), (1.05, 1.4), (1e-3, 0.0)])
+def test_the_way_of_a_stop_is_known(speed, rate):
+    """A joint that brakes as hard as it may, at a jerk that it may, stops where it is said to."""
+    step, most, jerk, place = 1e-5, 5.0, 250.0, 0.0
+    told, speed_, rate_ = stopping(speed, rate, most, jerk), speed, rate
+    while speed_ > 0:
+        # It eases off when just enough is left to end without acceleration.
+        easing = rate_ < 0 and speed_ <= rate_**2 / (2 * jerk)
+        rate_ = min(rate_ + jerk * step, -1e-9) if easing else max(rate_ - jerk * step, -most)
+        speed_ += rate_ * step
+        place += speed_ * step
+    assert told == pytest.approx(place, rel=0.01, abs=1e-5)
+
+
+@pytest.mark.parametrize(("bend", "refused"), [(0.03, False), (0.08, True)])
+def test_an_arm_that_leaves_its_way_is_stopped(bend, refused):
+    """The way was checked as a straight one: 3 degrees beside it are too many."""
+    goal = HOME + np.array([0.5, 0.1, 0, 0, 0, -0.3])
+
+    class Bent(Link):
+        clock = 0.0
+
+        def sample(self):
+            self.clock += 0.25
+            share = min(self.clock - 0.25, 1.0)
+            joints = HOME + share * (goal - HOME) + [0, 0, bend * np.sin(np.pi * share), 0, 0, 0]
+            return Sample(self.clock, joints, np.zeros(6), np.zeros(3))
+
+    with pytest.raises(faults.ProgramStopped, match="left the way") if refused else nullcontext():
+        follow(Bent(), goal, 1.0, lambda: None)
 
 
 def _robot():

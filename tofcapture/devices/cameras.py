@@ -7,13 +7,19 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from tofcapture.devices import Device
+from tofcapture.devices import Device, StereoDevice
+from tofcapture.devices.registry import check_keys
 from tofcapture.errors import ConfigError, DeviceError, FormatError
 from tofcapture.files.hdf import stereo_from, tof_from
 from tofcapture.files.seal import write_text
 from tofcapture.frames import StereoInfo, TofInfo
+
+if TYPE_CHECKING:
+    from tofcapture.devices.registry import StationContext
+
+_DESCRIPTION = ("model", "camera")
 
 
 class ReopenedCamera(Device):
@@ -59,6 +65,58 @@ class ReopenedCamera(Device):
         except DeviceError:
             self.close()
             raise
+
+
+class DescribedStereo(ReopenedCamera, StereoDevice):
+    """A stereo camera that says itself what it is; a file beside the station keeps what it said.
+
+    Parameters
+    ----------
+    table
+        ``[stereo]``: a text under ``key`` names the camera, ``description`` that file; ``model`` and ``camera`` describe a camera
+        that was never opened; the driver's own settings are those ``known``, and those that have ``defaults``.
+    context
+        The station.
+    driver
+        Begins the file's name.
+    """
+
+    def __init__(
+        self,
+        table: Mapping[str, Any],
+        context: StationContext,
+        driver: str,
+        known: Iterable[str],
+        defaults: Mapping[str, Any],
+        key: str = "serial",
+    ) -> None:
+        check_keys(table, (key, "description", *known, *defaults, *_DESCRIPTION), "[stereo]")
+        if not isinstance(name := table.get(key), str):
+            raise ConfigError(
+                f"[stereo] {key}: expected a text, as the camera's own tool lists it, got {name!r}",
+                hint="see docs/devices.md",
+            )
+        self._table, self._name, self._folder = {**defaults, **table}, name, Path(context.folder)
+        self._file = self._folder / table.get("description", f"{driver}-{name.replace('/', '-')}.toml")
+
+    def describe(self) -> StereoInfo:
+        """Say what this camera is, from ``station.toml`` and the description file; opens nothing.
+
+        Raises ConfigError when the camera was never opened and ``station.toml`` does not describe it.
+        """
+        where = f"[stereo] {self._name}"
+        said = described(read_description(self._file), self._table, _DESCRIPTION, where)
+        return stereo_info({**said, "serial": self._name}, where, "docs/devices.md")
+
+    def remember(self, said: Mapping[str, Any]) -> None:
+        """Keep what the opened camera says of itself; raises DeviceError when its intrinsics are not those it said before."""
+        known = read_description(self._file)
+        if known is not None and known.get("camera") != said.get("camera"):
+            raise DeviceError(
+                f"[stereo] {self._name}: its calibration is not the one of {self._file.name}",
+                hint="it was calibrated anew, or its size is another: delete that file, record and align again",
+            )
+        write_description(self._file, said)
 
 
 def read_description(path: Path) -> dict[str, Any] | None:

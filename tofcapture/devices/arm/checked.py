@@ -6,7 +6,8 @@ import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Generic, TypeVar
+from types import TracebackType
+from typing import TYPE_CHECKING, Generic, Self, TypeVar
 
 import numpy as np
 
@@ -23,9 +24,9 @@ from tofcapture.devices.arm.limits import (
 )
 from tofcapture.devices.clearance import workcell_of
 from tofcapture.devices.faults import ArmFault, NotReady, StopLatch
-from tofcapture.devices.kinematics import ArmModel, check_joints
-from tofcapture.errors import MotionRefused
-from tofcapture.frames import ArmState
+from tofcapture.devices.kinematics import ArmModel, check_joints, pose_error
+from tofcapture.errors import ConfigError, MotionRefused
+from tofcapture.frames import ArmInfo, ArmState
 from tofcapture.poses import Float64
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ L = TypeVar("L", bound=Link)
 
 
 class CheckedArm(Arm, Generic[L]):
-    """A real arm; its driver opens ``_link``, closes by setting ``_closed``, and gives the verbs below."""
+    """A real arm; its driver says how to ``connect``, and gives the abstract verbs below."""
 
     def __init__(self, limits: Limits, context: StationContext) -> None:
         self._limits, self._context = limits, context
@@ -48,13 +49,42 @@ class CheckedArm(Arm, Generic[L]):
         self._silence = 0.0
         self._fault: ArmFault | None = None
 
+    def connect(self) -> L:
+        """Connect to the controller; nothing moves. Raises :class:`ArmFault`: the named state in which it is."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        """Connect, and check that this is the arm it should be; raises ConfigError for another one."""
+        self.opening()
+        self._link = self.connect()
+        try:
+            self._check_model(self._link.fresh())
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop, and let go of the controller."""
+        link = self._link
+        try:
+            if link is not None and link.trouble() is None:
+                self.halt()
+        finally:
+            self._closed.set()
+            if link is not None:
+                link.close()
+            self._link = None
+
     @abstractmethod
     def go(self, start: Sample, goal: Float64, speed: float, check: Callable[[], None]) -> None:
         """Move the fastest joint at ``speed`` rad/s on the straight way, until arrived; ``check`` raises when it shall stop."""
 
     @abstractmethod
     def halt(self) -> None:
-        """Stop the arm if it can be told."""
+        """Stop the arm if it can be told; one that is not open, or does not move, is left alone."""
 
     @abstractmethod
     def flange(self, sample: Sample) -> Float64:
@@ -69,6 +99,10 @@ class CheckedArm(Arm, Generic[L]):
         """Begin anew: no stop holds, nothing was sent."""
         self._latch, self._goal, self._fault = StopLatch(), None, None
         self._closed.clear()
+
+    def describe(self) -> ArmInfo:
+        """Name the model and the controller's address."""
+        return ArmInfo(self._limits.model.name, self._limits.host)
 
     def kinematics(self) -> ArmModel:
         """Give the geometry that every motion is checked with."""
@@ -120,6 +154,7 @@ class CheckedArm(Arm, Generic[L]):
     def stop(self) -> None:
         """Stop now, and stay so."""
         self._latch.stop()
+        self.halt()
 
     def interrupt(self) -> None:
         """Make a running ``move_to`` stop; from another thread."""
@@ -142,6 +177,11 @@ class CheckedArm(Arm, Generic[L]):
             fault = link.trouble()
         if fault is not None and not self._closed.is_set():
             raise fault
+
+    def _check_model(self, sample: Sample) -> None:
+        """Refuse an arm that is not the model: every check of the way would be wrong."""
+        if wrong := pose_error(self._limits.model, sample.joints, self.flange(sample)):
+            raise ConfigError(f"[arm] {wrong}", hint="is this the arm that the driver is for?")
 
     def _opened(self) -> L:
         if self._link is None or self._closed.is_set():

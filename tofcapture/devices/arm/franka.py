@@ -14,43 +14,35 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tofcapture.devices import faults
 from tofcapture.devices.arm.checked import CheckedArm
-from tofcapture.devices.arm.limits import Limits, Sample, duration, follow, read_limits
-from tofcapture.devices.faults import (
-    ArmFault,
-    ControllerSilent,
-    LinkLost,
-    NotReady,
-    ProgramStopped,
-    ProtectiveStop,
-    SafetyStop,
-    StaleData,
-)
+from tofcapture.devices.arm.limits import Limits, Link, Sample, duration, follow, read_limits, stopping
+from tofcapture.devices.faults import ArmFault, NotReady
 from tofcapture.devices.host import hosted
-from tofcapture.devices.kinematics import ArmModel, chain_model, pose_error
+from tofcapture.devices.kinematics import ArmModel, chain_model
 from tofcapture.errors import ConfigError
-from tofcapture.frames import ArmInfo
 from tofcapture.poses import Float64, rotation_exp, transform
 
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
 
 _PORT = 1337
-_CONNECT = 2.0  # s
+_CONNECT, _POLL, _LATE = 2.0, 0.02, 0.01  # s; the last until an order to stop is obeyed
 _STALE = 1.0  # s without a newer state
 _NEAR = np.radians(0.05)  # its joint controller leaves a small error
-_JERK = 25.0  # of a stop, times its deceleration: 0.04 s to build it up
+_JERK = 50.0  # of a stop, times its deceleration: 0.02 s to build it up
 _STRETCH = 0.1  # of the time that counts while the library is on the way
-_SLACK = 2e-3  # rad; where the arm was sent and where it is differ by less
+_SHARE = 0.01  # of the limits that a joint has at least, however little it turns
+_CALM = (1e-3, 1e-2)  # rad/s and rad/s^2 that a motion may begin with
+_BRAKES = 2.0  # s that a stop may take before it is cut off
 _MARGIN = 0.05  # rad; within the manufacturer's limits
 _STATES: dict[str, tuple[type[ArmFault], str, str]] = {
-    "Reflex": (ProtectiveStop, "it stopped by reflex", "look for what it hit; press and release the user stop; then start again"),
-    "UserStopped": (SafetyStop, "the user stop is pressed", "find out why; release it; then start again"),
+    "Reflex": (faults.ProtectiveStop, "it stopped by reflex", "look for what it hit; press and release the user stop; then start again"),
+    "UserStopped": (faults.SafetyStop, "the user stop is pressed", "find out why; release it; then start again"),
     "Guiding": (NotReady, "it is guided by hand", "let go of the guiding button; choose Execution in Desk"),
     "AutomaticErrorRecovery": (NotReady, "it recovers from an error", "wait; then start again"),
     "Other": (NotReady, "its brakes are closed", "unlock the joints and activate FCI in Desk; then start again"),
@@ -70,7 +62,7 @@ def fr3() -> ArmModel:
     return chain_model("fr3", fixed, low, high, radius=0.09)
 
 
-class FrankaLink:
+class FrankaLink(Link):
     """The library's connection to the controller at ``host``.
 
     Raises :class:`ConfigError`: the library is not installed; :class:`ArmFault`: it cannot connect.
@@ -94,16 +86,19 @@ class FrankaLink:
         """Turn the library's errors into named states, here and nowhere else."""
         franky = self.franky
         kinds = {
-            franky.NetworkException: LinkLost, franky.IncompatibleVersionException: NotReady,
-            franky.RealtimeException: NotReady, franky.ControlException: ProtectiveStop,
+            franky.NetworkException: faults.LinkLost, franky.IncompatibleVersionException: NotReady,
+            franky.RealtimeException: NotReady, franky.ControlException: faults.ProtectiveStop,
+            franky.Exception: faults.ProgramStopped,
+            RuntimeError: faults.LinkLost,  # of its network library, unless its planner fails
         }  # fmt: skip
         try:
             yield
-        except (*kinds, franky.Exception, RuntimeError) as err:
-            kind = next((k for e, k in kinds.items() if isinstance(err, e)), ProgramStopped)
-            hint = (
-                'realtime = "ignore" does without, with a caution' if "realtime" in str(err).lower() else ""
-            )
+        except tuple(kinds) as err:
+            kind = next(k for e, k in kinds.items() if isinstance(err, e))
+            if "planner" in str(err):
+                kind = faults.ProgramStopped
+            kernel = "realtime" in str(err).lower()
+            hint = 'realtime = "ignore" does without, with a caution' if kernel else ""
             raise kind(f"{self._host}: {doing}: {err}", hint) from err
 
     def _state(self) -> Any:
@@ -116,23 +111,11 @@ class FrankaLink:
         if stamp != self._newest:
             self._newest, self._seen = stamp, now
         if now - self._seen > _STALE:
-            raise StaleData(f"{self._host}: no newer state for {now - self._seen:.1f} s")
+            raise faults.StaleData(f"{self._host}: no newer state for {now - self._seen:.1f} s")
         if state.robot_mode.name in _STATES:
             kind, words, hint = _STATES[state.robot_mode.name]
             raise kind(f"the controller reports: {words}", hint)
         return state
-
-    def trouble(self) -> ArmFault | None:
-        """Find what is wrong now: link, age of the state, the arm's mode."""
-        try:
-            self._state()
-        except ArmFault as fault:
-            return fault
-        return None
-
-    def overdue(self) -> ArmFault | None:
-        """Find no command that hangs: the library has time limits of its own."""
-        return None
 
     def sample(self) -> Sample:
         """Read joints, speeds and the flange's pose (4, 4), flat after its place."""
@@ -140,28 +123,35 @@ class FrankaLink:
         joints, speeds = np.array(state.q, float), np.array(state.dq, float)
         T = np.array(state.O_T_EE.matrix, float) @ np.linalg.inv(np.array(state.F_T_EE.matrix, float))
         if not all(np.isfinite(a).all() for a in (joints, speeds, T)):
-            raise StaleData(f"{self._host}: the measured joints are no numbers: {joints.tolist()}")
+            raise faults.StaleData(f"{self._host}: the measured joints are no numbers: {joints.tolist()}")
         # The library makes the way as fast as it hears from the arm: late states stretch it.
         scaling = _STRETCH if self.moving and self.robot.is_in_control else 1.0
         return Sample(self._newest, joints, speeds, np.concatenate([T[:3, 3], T.ravel()]), scaling)
+
+    def brake(self) -> Float64:
+        """Find where the arm comes to rest if it brakes on its way now; the library's own stop goes back to where it was told."""
+        state, most = self.robot.state, self.robot.joint_acceleration_limit.get()
+        place, speeds = np.array(state.q_d, float), np.array(state.dq_d, float)
+        lead = int(np.abs(speeds).argmax())
+        if (speed := float(abs(speeds[lead]))) < _CALM[0]:
+            return place
+        rate = float(state.ddq_d[lead] * np.sign(speeds[lead]))
+        way = stopping(speed, rate, float(most[lead]), _JERK * float(most[lead])) + _LATE * speed
+        return place + speeds / speed * way
 
     def close(self) -> None:
         """Let go of the controller, which talks to one at a time."""
         self.robot = None
 
-    def fresh(self) -> Sample:
-        """Wait for a sample that was measured after this call: the second new one."""
-        stamps = {self.sample().timestamp}
-        while True:
-            sample = self.sample()
-            stamps.add(sample.timestamp)
-            if len(stamps) > 2:
-                return sample
-
-    def kick(self) -> None:
-        """Do nothing: a controller that hears no command for some milliseconds stops the arm by itself."""
-
-    kick_seeing = kick
+    def rest(self) -> None:
+        """Wait until no speed or acceleration is commanded: the library begins with them, and a joint of a short way cannot brake."""
+        end = self.sample().timestamp + _BRAKES
+        while (state := self._state()) and any(
+            np.abs(a).max() > most for a, most in zip((state.dq_d, state.ddq_d), _CALM, strict=True)
+        ):
+            if self._newest > end:
+                raise faults.NotSettled(f"{self._host}: a speed is still commanded, after {_BRAKES:g} s")
+            time.sleep(_POLL)
 
 
 class FrankaArm(CheckedArm[FrankaLink]):
@@ -180,10 +170,7 @@ class FrankaArm(CheckedArm[FrankaLink]):
         said = read_limits(table, {"realtime": ("enforce", "ignore")})
         self._enforce = said.pop("realtime", "enforce") == "enforce"
         super().__init__(Limits(model=fr3(), **said), context)
-
-    def describe(self) -> ArmInfo:
-        """Name the model and the address."""
-        return ArmInfo(self._limits.model.name, self._limits.host)
+        self._halting = threading.Lock()
 
     def probe(self) -> str:
         """See whether a controller listens; it hears nothing else."""
@@ -191,7 +178,7 @@ class FrankaArm(CheckedArm[FrankaLink]):
         try:
             socket.create_connection((host, _PORT), timeout=_CONNECT).close()
         except OSError as err:
-            raise ControllerSilent(f"{host}: nothing answers at port {_PORT}: {err}") from err
+            raise faults.ControllerSilent(f"{host}: nothing answers at port {_PORT}: {err}") from err
         return f"{host} listens"
 
     def cautions(self) -> list[str]:
@@ -199,28 +186,10 @@ class FrankaArm(CheckedArm[FrankaLink]):
         late = '[arm] realtime = "ignore": a late command makes the controller stop the arm by reflex'
         return [] if self._enforce else [late]
 
-    def __enter__(self) -> Self:
-        """Connect, and check that this is the arm it should be. Nothing moves."""
+    def connect(self) -> FrankaLink:
+        """Look for the controller, and connect."""
         self.probe()
-        self.opening()
-        self._link = FrankaLink(self._limits.host, enforce=self._enforce)
-        sample = self._link.fresh()
-        if wrong := pose_error(self._limits.model, sample.joints, self.flange(sample)):
-            raise ConfigError(f"[arm] {wrong}", hint="this driver knows the Franka Research 3")
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop, and let go of the controller."""
-        try:
-            if self._link is not None and self._link.trouble() is None:
-                self.halt()
-        finally:
-            self._closed.set()
-            if self._link is not None:
-                self._link.close()
-            self._link = None
+        return FrankaLink(self._limits.host, enforce=self._enforce)
 
     def flange(self, sample: Sample) -> Float64:
         """Find the flange's pose: the controller's, without its end effector."""
@@ -229,10 +198,11 @@ class FrankaArm(CheckedArm[FrankaLink]):
     def go(self, start: Sample, goal: Float64, speed: float, check: Callable[[], None]) -> None:
         """Move at a speed. Limits in proportion to each joint's turn make the way straight."""
         link, limits = self._opened(), self._limits
-        turn = np.abs(goal - start.joints) + _SLACK
-        share = turn / turn.max()
+        turn = np.abs(goal - start.joints)
+        share = np.maximum(turn / turn.max(), _SHARE)
         hard = limits.deceleration
         soft = min(limits.acceleration / hard, 1.0)
+        link.rest()
         with link.errors("moving"):
             link.robot.joint_velocity_limit.set(speed * share)
             link.robot.joint_acceleration_limit.set(hard * share)
@@ -248,21 +218,21 @@ class FrankaArm(CheckedArm[FrankaLink]):
             link.moving = False
 
     def halt(self) -> None:
-        """Brake on the way, and let the controller go."""
+        """Brake on the way, and let the controller go; who stops and who moves may ask at once."""
         link = self._link
-        if link is None or self._closed.is_set() or not link.robot.is_in_control:
+        if link is None or self._closed.is_set():
             return
-        with link.errors("stopping"):
-            link.robot.move(link.franky.JointStopMotion(), asynchronous=True)
-            link.robot.join_motion()
-
-    def stop(self) -> None:
-        """Stop now, and stay so."""
-        super().stop()
-        self.halt()
+        with self._halting, link.errors("stopping"):
+            if not link.robot.is_in_control:
+                return
+            link.robot.move(link.franky.JointMotion(link.brake().tolist()), asynchronous=True)
+            if not link.robot.join_motion(_BRAKES):
+                link.robot.stop()
 
 
 _DEADLINES = {"__enter__": 12.0, "move_to": 600.0}
 DRIVERS = {
-    "arm": hosted("arm", "tofcapture.devices.arm.franka:FrankaArm", _DEADLINES, overdue=ControllerSilent)
+    "arm": hosted(
+        "arm", "tofcapture.devices.arm.franka:FrankaArm", _DEADLINES, overdue=faults.ControllerSilent
+    )
 }

@@ -142,9 +142,10 @@ def joint_speed(limits: Limits, rig: Rig, workcell: Workcell, start: Float64, go
 
 
 ARRIVED = np.radians(0.02)
-_POLL = 0.02  # s
+_POLL, _FRESH = 0.02, 0.002  # s between looks; at data that come each millisecond or eight
 _READINGS = 3  # at the goal
 _WINDOW = 0.2  # s over which the arm must be at rest
+_ASTRAY = 0.05  # rad off the way that was checked
 _STILL = (1e-3, 1e-4, np.radians(0.02))  # rad/s of any joint; m of the flange; rad of any joint
 _SETTLING = 3.0  # s
 
@@ -168,24 +169,38 @@ class Link(Protocol):
         ...
 
     def fresh(self) -> Sample:
-        """Wait for a sample that was measured after this call."""
-        ...
+        """Wait for a sample that was measured after this call: the second new one."""
+        stamps = {self.sample().timestamp}
+        while True:
+            sample = self.sample()
+            stamps.add(sample.timestamp)
+            if len(stamps) > 2:
+                return sample
+            time.sleep(_FRESH)
 
     def kick(self) -> None:
         """Feed the controller's watchdog, where there is one."""
-        ...
+        return
 
     def kick_seeing(self) -> None:
         """Feed the watchdog of a moving arm: only while its data are new, else it shall stop."""
-        ...
+        return
+
+    def close(self) -> None:
+        """Let go of the controller."""
+        return
 
     def overdue(self) -> ArmFault | None:
-        """Find the command that runs too long, if there is one."""
-        ...
+        """Find the command that runs too long; none where the library has time limits of its own."""
+        return None
 
     def trouble(self) -> ArmFault | None:
         """Find what is wrong now."""
-        ...
+        try:
+            self.sample()
+        except ArmFault as fault:
+            return fault
+        return None
 
 
 def follow(
@@ -196,12 +211,15 @@ def follow(
     Half as much again as the planned ``seconds`` and 2 s are granted, by the controller's clock, longer when the speed slider is low.
 
     Raises :class:`MotionStopped`: somebody said stop; :class:`ProgramStopped`: the arm did not arrive in
-    time; :class:`ArmFault`: what else went wrong.
+    time, or left the straight way; :class:`ArmFault`: what else went wrong.
     """
-    patience, last, there = 1.5 * seconds + 2.0, link.sample().timestamp, 0
+    start = link.sample()
+    patience, last, there = 1.5 * seconds + 2.0, start.timestamp, 0
     while there < _READINGS:
         check()
         sample = link.sample()
+        if (off := _off_way(sample.joints - start.joints, goal - start.joints)) > _ASTRAY:
+            raise ProgramStopped(f"the arm left the way that was checked, by {np.degrees(off):.1f} deg")
         link.kick_seeing()
         left = float(np.abs(sample.joints - goal).max())
         there = there + 1 if left < near else 0
@@ -209,6 +227,12 @@ def follow(
         if patience < 0:
             raise ProgramStopped(f"the arm did not arrive in time: {np.degrees(left):.1f} deg are left")
         time.sleep(_POLL)
+
+
+def _off_way(gone: Float64, way: Float64) -> float:
+    """Find the largest angle of a joint, rad, between (J,) and the nearest place of the straight ``way`` (J,)."""
+    share = float(gone @ way) / max(float(way @ way), 1e-12)
+    return float(np.abs(gone - min(max(share, 0.0), 1.0) * way).max())
 
 
 def settle(link: Link, ringing: float, check: Callable[[], None]) -> Sample:
@@ -257,6 +281,15 @@ def duration(way: Float64, speed: float, acceleration: float) -> float:
     if length < speed * ramp:
         return 2 * float(np.sqrt(length / acceleration))
     return length / speed + ramp
+
+
+def stopping(speed: float, rate: float, most: float, jerk: float) -> float:
+    """Tell how far, rad, a joint goes from ``speed`` >= 0 rad/s and ``rate`` rad/s^2 until it rests, at ``most`` rad/s^2 and ``jerk`` rad/s^3."""
+    peak = min(most, float(np.sqrt(jerk * speed + rate**2 / 2)))
+    rise = max(rate + peak, 0.0) / jerk  # s until it brakes at its peak
+    fast, slow = speed + rate * rise - jerk * rise**2 / 2, peak**2 / (2 * jerk)
+    braking = max(fast**2 - slow**2, 0.0) / (2 * peak)
+    return speed * rise + rate * rise**2 / 2 - jerk * rise**3 / 6 + braking + peak**3 / (6 * jerk**2)
 
 
 def _wait(link: Link, seconds: float) -> None:

@@ -12,30 +12,20 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofcapture.devices import StereoDevice
-from tofcapture.devices.cameras import (
-    ReopenedCamera,
-    described,
-    read_description,
-    stereo_info,
-    write_description,
-)
+from tofcapture.devices.cameras import DescribedStereo
 from tofcapture.devices.host import hosted
-from tofcapture.devices.registry import check_keys
 from tofcapture.errors import ConfigError, DeviceError
-from tofcapture.frames import StereoFrame, StereoInfo
+from tofcapture.frames import StereoFrame
 
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
 
-_SETTINGS = ("serial", "flexview", "exposure", "timeout", "link", "description", "library")
-_DESCRIPTION = ("model", "camera")
+_DEFAULTS = {"flexview": 8, "timeout": 5.0, "link": "refuse"}
 _TIMEOUTS = ("CaptureTimeout", "DeviceTimeout", "Timeout")
 _HINTS = {
     "CaptureTimeout": "network: a direct link, jumbo frames, no switch; a long FlexView needs a longer [stereo] timeout",
@@ -48,7 +38,7 @@ class CaptureTimeoutError(DeviceError):
     """The images did not arrive in time."""
 
 
-class Ensenso(ReopenedCamera, StereoDevice):
+class Ensenso(DescribedStereo):
     """One Ensenso camera.
 
     Its point maps are in the left eye's frame, in metres, NaN where nothing was measured. The camera finds the exposure
@@ -66,20 +56,13 @@ class Ensenso(ReopenedCamera, StereoDevice):
     """
 
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
-        self._table = _checked(table)
-        self._serial = str(table["serial"])
-        self._file = Path(context.folder) / str(table.get("description", f"ensenso-{self._serial}.toml"))
+        super().__init__(table, context, "ensenso", ("exposure", "library"), _DEFAULTS)
+        if self._table["link"] not in ("refuse", "clear"):
+            raise ConfigError(f'[stereo] link: expected "refuse" or "clear", got {self._table["link"]!r}')
+        if (pairs := self._table["flexview"]) not in range(17) or pairs == 1:
+            raise ConfigError(f"[stereo] flexview: expected 0 (off) or 2 to 16 image pairs, got {pairs!r}")
         self._camera: Any = None
         self._exposure: float | None = None
-
-    def describe(self) -> StereoInfo:
-        """Say what this camera is, from ``station.toml`` and the description file; opens nothing.
-
-        Raises ConfigError when the camera was never opened and ``station.toml`` does not describe it.
-        """
-        where = f"[stereo] {self._serial}"
-        said = described(read_description(self._file), self._table, _DESCRIPTION, where)
-        return stereo_info({**said, "serial": self._serial}, where, "docs/devices.md")
 
     def capture(self) -> StereoFrame:
         """Take one point map.
@@ -111,40 +94,17 @@ class Ensenso(ReopenedCamera, StereoDevice):
             self._camera.compute_point_map()
             points_mm = self._camera.get_point_map()
         info = self.describe()
-        return StereoFrame(metres(points_mm, info.camera.shape, self._serial), middle, info)
+        return StereoFrame(metres(points_mm, info.camera.shape, self._name), middle, info)
 
     def connect(self, stack: ExitStack) -> None:
         """Open SDK and camera, set its parameters, and see that its calibration is the known one."""
         stack.enter_context(library(self._table.get("library")))
-        camera = self._camera = stack.enter_context(_open_camera(self._serial))
+        camera = self._camera = stack.enter_context(_open_camera(self._name))
         _check_link(camera, clear=self._table["link"] == "clear")
         if (exposure := self._table.get("exposure")) is not None:
             self._exposure = float(exposure)
         _configure(camera, int(self._table["flexview"]), self._exposure)
-        said, known = _said_by(camera), read_description(self._file)
-        if known is not None and known.get("camera") != said["camera"]:
-            raise DeviceError(
-                f"[stereo] {self._serial}: its calibration is not the one of {self._file.name}",
-                hint="it was calibrated anew: delete that file, begin a new recording, align again",
-            )
-        write_description(self._file, said)
-
-
-def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Check ``[stereo]``, fill in what it leaves out."""
-    check_keys(table, (*_SETTINGS, *_DESCRIPTION), "[stereo]")
-    if not isinstance(table.get("serial"), str):
-        raise ConfigError(
-            f'[stereo] serial: expected the camera\'s serial, "171197", got {table.get("serial")!r}'
-        )
-    full = {"flexview": 8, "timeout": 5.0, "link": "refuse", **table}
-    if full["link"] not in ("refuse", "clear"):
-        raise ConfigError(f'[stereo] link: expected "refuse" or "clear", got {full["link"]!r}')
-    if full["flexview"] not in range(17) or full["flexview"] == 1:
-        raise ConfigError(
-            f"[stereo] flexview: expected 0 (off) or 2 to 16 image pairs, got {full['flexview']!r}"
-        )
-    return full
+        self.remember(_said_by(camera))
 
 
 def metres(points_mm: NDArray[np.float32], shape: tuple[int, int], serial: str) -> NDArray[np.float32]:

@@ -12,33 +12,21 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.devices import StereoDevice
-from tofcapture.devices.cameras import (
-    ReopenedCamera,
-    described,
-    read_description,
-    stereo_info,
-    write_description,
-)
+from tofcapture.devices.cameras import DescribedStereo
 from tofcapture.devices.host import hosted
-from tofcapture.devices.registry import check_keys
 from tofcapture.errors import ConfigError, DeviceError
-from tofcapture.frames import StereoFrame, StereoInfo
+from tofcapture.frames import StereoFrame
 
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
 
-_DESCRIPTION = ("model", "camera")
 _FEATURES = ("settings", "lit", "dark")
-_DEFAULTS = {"pixels": "Coord3D_ABC32f", "timeout": 5.0}
-_SETTINGS = ("device", "exposure", "description", *_FEATURES, *_DEFAULTS)
 _UNITS = {"Millimeter": 1e-3, "Inch": 0.0254, "Meter": 1.0}
 # What a buffer may hold: the standard's numbers, whether it is whole points, and the type of a value
 _FORMATS = {
@@ -46,7 +34,7 @@ _FORMATS = {
 }  # fmt: skip
 
 
-class GenICam(ReopenedCamera, StereoDevice):
+class GenICam(DescribedStereo):
     """One such camera: it hands out an organised cloud, or a range image and its intrinsics.
 
     Parameters
@@ -61,24 +49,11 @@ class GenICam(ReopenedCamera, StereoDevice):
     """
 
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
-        check_keys(table, (*_SETTINGS, *_DESCRIPTION), "[stereo]")
-        if not isinstance(table.get("device"), str):
-            raise ConfigError(
-                f"[stereo] device: expected a camera's name or address, got {table.get('device')!r}",
-                hint="arv-tool-0.8 lists cameras; see docs/devices.md",
-            )
+        defaults = {"pixels": "Coord3D_ABC32f", "timeout": 5.0}
+        super().__init__(table, context, "genicam", ("exposure", *_FEATURES), defaults, key="device")
         if wrong := [k for k in _FEATURES if not isinstance(table.get(k, {}), Mapping)]:
             raise ConfigError(f"[stereo] {wrong[0]}: expected a table of features")
-        self._table, self._name = {**_DEFAULTS, **table}, str(table["device"])
-        default = f"genicam-{self._name.replace('/', '-')}.toml"
-        self._file = Path(context.folder) / str(table.get("description", default))
         self._camera: Any = None
-
-    def describe(self) -> StereoInfo:
-        """Say what this camera is, from ``station.toml`` and the description file; opens nothing."""
-        where = f"[stereo] {self._name}"
-        said = described(read_description(self._file), self._table, _DESCRIPTION, where)
-        return stereo_info({**said, "serial": said.get("serial", self._name)}, where, "docs/devices.md")
 
     def capture(self) -> StereoFrame:
         """Take one frame; the camera exposes for it alone, lit where ``lit`` and ``dark`` say how.
@@ -151,7 +126,7 @@ class GenICam(ReopenedCamera, StereoDevice):
             self._set("settings")
             self._set("dark")
             self._scale, self._offset, self._invalid = self._coordinates()
-            self._remember()
+            self.remember(self._said())
 
     def _coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float | None]:
         """Scale and offset (3,) of A, B, C in metres, and the value that stands for none."""
@@ -177,8 +152,8 @@ class GenICam(ReopenedCamera, StereoDevice):
         for feature, value in self._table.get(group, {}).items():
             getattr(self._camera, f"set_{kinds[type(value)]}")(feature, value)
 
-    def _remember(self) -> None:
-        """Keep what the camera says of itself; refuse one whose intrinsics have changed."""
+    def _said(self) -> dict[str, Any]:
+        """Name, and intrinsics where the camera has them."""
         _, _, width, height = self._camera.get_region()
         said: dict[str, Any] = {"model": self._camera.get_model_name(), "serial": self._name}
         focal = self._ask("Scan3dFocalLength", "float", None)
@@ -190,13 +165,7 @@ class GenICam(ReopenedCamera, StereoDevice):
             }
             said["camera"] = {"width": width, "height": height, "fx": focal, "fy": focal * ratio}
             said["camera"] |= {"cx": place["U"], "cy": place["V"]}
-        known = read_description(self._file)
-        if known is not None and known.get("camera") != said.get("camera"):
-            raise DeviceError(
-                f"[stereo] {self._name}: its intrinsics are not those of {self._file.name}",
-                hint="it was calibrated anew, or its region is another: delete that file, record and align again",
-            )
-        write_description(self._file, said)
+        return said
 
 
 def points_of(

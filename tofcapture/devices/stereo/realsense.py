@@ -19,28 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofcapture.camera import Camera
-from tofcapture.devices import StereoDevice
-from tofcapture.devices.cameras import (
-    ReopenedCamera,
-    described,
-    read_description,
-    stereo_info,
-    write_description,
-)
+from tofcapture.devices.cameras import DescribedStereo
 from tofcapture.devices.host import hosted
-from tofcapture.devices.registry import check_keys
 from tofcapture.errors import ConfigError, DeviceError
-from tofcapture.frames import StereoFrame, StereoInfo
+from tofcapture.frames import StereoFrame
 
 if TYPE_CHECKING:
     from tofcapture.devices.registry import StationContext
 
-_DESCRIPTION = ("model", "camera")
 _DEFAULTS = {"size": [1280, 720], "fps": 6, "timeout": 5.0, "settle": 5}
-_SETTINGS = ("serial", "exposure", "description", "bag", *_DEFAULTS)
 
 
-class RealSense(ReopenedCamera, StereoDevice):
+class RealSense(DescribedStereo):
     """One RealSense depth camera. Its projector is lit for its own exposures only: it would shine into ToF pixels.
 
     Parameters
@@ -55,24 +45,8 @@ class RealSense(ReopenedCamera, StereoDevice):
     """
 
     def __init__(self, table: Mapping[str, Any], context: StationContext) -> None:
-        check_keys(table, (*_SETTINGS, *_DESCRIPTION), "[stereo]")
-        if not isinstance(table.get("serial"), str):
-            raise ConfigError(
-                f'[stereo] serial: expected "819612073528" or the like, got {table.get("serial")!r}'
-            )
-        self._table = {**_DEFAULTS, **table}
-        self._folder, self._serial = Path(context.folder), str(table["serial"])
-        self._file = self._folder / str(table.get("description", f"realsense-{self._serial}.toml"))
+        super().__init__(table, context, "realsense", ("exposure", "bag"), _DEFAULTS)
         self._sensor: Any = None
-
-    def describe(self) -> StereoInfo:
-        """Say what this camera is, from ``station.toml`` and the description file; opens nothing.
-
-        Raises ConfigError when the camera was never opened and ``station.toml`` does not describe it.
-        """
-        where = f"[stereo] {self._serial}"
-        said = described(read_description(self._file), self._table, _DESCRIPTION, where)
-        return stereo_info({**said, "serial": self._serial}, where, "docs/devices.md")
 
     def capture(self) -> StereoFrame:
         """Light the projector, take one depth image, put the projector out.
@@ -86,7 +60,7 @@ class RealSense(ReopenedCamera, StereoDevice):
         DeviceError
             The camera does not deliver; the next call opens it anew.
         """
-        with self.opened(), _errors(f"capturing with {self._serial}"):
+        with self.opened(), _errors(f"capturing with {self._name}"):
             with self._projector():
                 for _ in range(int(self._table["settle"])):
                     self._wait()  # exposed before, or while the exposure was sought
@@ -127,18 +101,11 @@ class RealSense(ReopenedCamera, StereoDevice):
                 f"the driver realsense needs pyrealsense2: {err}", hint="pip install 'tofcapture[realsense]'"
             ) from err
         self._rs = rs
-        with _errors(f"opening {self._serial}"):
+        with _errors(f"opening {self._name}"):
             bag = self._table.get("bag")
-            device = _found(rs, self._serial, None if bag is None else self._folder / str(bag))
+            device = _found(rs, self._name, None if bag is None else self._folder / str(bag))
             sensor, profile = _mode(rs, device, tuple(self._table["size"]), int(self._table["fps"]))
-            said = _said_by(rs, device, profile, self._serial)
-            known = read_description(self._file)
-            if known is not None and known.get("camera") != said["camera"]:
-                raise DeviceError(
-                    f"[stereo] {self._serial}: its calibration is not the one of {self._file.name}",
-                    hint="it was calibrated anew, or size is another: delete that file, record and align again",
-                )
-            write_description(self._file, said)
+            self.remember(_said_by(rs, device, profile, self._name))
             self._sensor, self._queue = sensor, rs.frame_queue(1)
             self._unit = float(sensor.get_option(rs.option.depth_units))
             self._expose(rs)

@@ -104,7 +104,7 @@ class UrArm(CheckedArm[Link]):
 
     def stop(self) -> None:
         """Stop now, and stay so; an arm whose script has ended has stopped already."""
-        super().stop()
+        self._latch.stop()
         link = self._link
         if link is not None and not self._closed.is_set() and link.playing:
             link.command("stopJ", 4.0, self._settings.deceleration)

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from tofcapture.devices import faults
+from tofcapture.devices.arm import limits
 from tofcapture.devices.arm.limits import Sample
 from tofcapture.errors import ConfigError, DeviceError
 
@@ -135,7 +136,7 @@ _VARIABLES = (
 )  # fmt: skip
 
 
-class Link:
+class Link(limits.Link):
     """Both connections of the library to the controller at ``host``; with ``scaling`` it reports its speed slider.
 
     Raises :class:`ConfigError`: the library is not installed; :class:`NotReady`, :class:`ControllerSilent`:
@@ -219,16 +220,6 @@ class Link:
             raise faults.StaleData(f"{self._host}: the measured joints are no numbers: {joints.tolist()}")
         # A controller at rest may say 0: the slider is not at zero while a program plays.
         return Sample(stamp, joints, speeds, pose, scaling if 0.01 <= scaling <= 1 else 1.0)
-
-    def fresh(self) -> Sample:
-        """Wait for a sample that was measured after this call: the second new one."""
-        stamps = {self._receive.getTimestamp()}
-        while True:
-            sample = self.sample()
-            stamps.add(sample.timestamp)
-            if len(stamps) > 2:
-                return sample
-            time.sleep(0.002)
 
     @property
     def seeing(self) -> bool:
