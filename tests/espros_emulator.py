@@ -19,15 +19,15 @@ class Emulator:
     """Serves one camera; ``range_m`` (H, W) is what it sees, with ``amplitude`` counts.
 
     ``fault`` is what goes wrong: "mute" (no answer), "no data" (answers, sends nothing), "unplugged" (both end after ``after``
-    images), "binned" (half the rows), "stolen" (another exposure).
+    images), "binned" (half the rows), "stolen" (another exposure). ``ports`` are those of commands and of data, 0 for any.
     """
 
-    def __init__(self, range_m, amplitude=900.0, chip=(7, 4321), fault="", after=10**9):
+    def __init__(self, range_m, amplitude=900.0, chip=(7, 4321), fault="", after=10**9, ports=(0, 0)):
         self.range, self.amplitude, self.chip, self.fault, self.after = range_m, amplitude, chip, fault, after
         self.mhz, self.exposure, self.log, self.images = 12.0, 0, [], 0
-        self._tcp = socket.create_server(("127.0.0.1", 0))
+        self._tcp = socket.create_server(("127.0.0.1", ports[0]))
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-            free.bind(("127.0.0.1", 0))
+            free.bind(("127.0.0.1", ports[1]))
             self.data_port = free.getsockname()[1]
         self.port = self._tcp.getsockname()[1]
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

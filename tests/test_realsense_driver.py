@@ -121,11 +121,10 @@ def test_a_recording_is_made_and_checks(camera, monkeypatch, tmp_path):
     np.testing.assert_allclose(np.nanmedian(view.stereo.points[..., 2]), 1.5, atol=1e-4)
 
 
-def test_a_bag_is_played(camera, monkeypatch, tmp_path):
-    """What the library recorded to a bag comes out of it again."""
-    bag = tmp_path / "wall.db3"
+def write_bag(path, camera):
+    """Record a second of an emulated camera's wall to a file, by the library."""
     camera.sensor.set_option(rs.option.emitter_enabled, 1.0)
-    recorder = rs.recorder(str(bag), camera.device)
+    recorder = rs.recorder(str(path), camera.device)
     sensor, queue = recorder.query_sensors()[0], rs.frame_queue(9)
     sensor.open(sensor.get_stream_profiles()[0])
     sensor.start(queue)
@@ -133,7 +132,11 @@ def test_a_bag_is_played(camera, monkeypatch, tmp_path):
         queue.wait_for_frame(5000)
     sensor.stop()
     sensor.close()
-    del recorder, sensor
+
+
+def test_a_bag_is_played(camera, monkeypatch, tmp_path):
+    """What the library recorded to a bag comes out of it again."""
+    write_bag(tmp_path / "wall.db3", camera)
     monkeypatch.undo()  # the library's own context
     with driver(tmp_path, bag="wall.db3", settle=1) as stereo:
         frame = stereo.capture()
