@@ -12,6 +12,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 
 import generate  # noqa: E402
+from sphinx.domains.python import PyObject  # noqa: E402
 
 import tofcapture  # noqa: E402
 
@@ -35,7 +36,7 @@ autodoc_mock_imports = generate.ABSENT
 
 exclude_patterns = ["_build"]
 nitpicky = False
-# Words such as "depth" are attributes of many classes; where the reference offers them all, none is meant more than the others.
+# A property's first words up to a colon are taken for its type, "unit" or "frames" among them; classes have attributes so named.
 suppress_warnings = ["ref.python"]
 
 smartquotes = False  # a command with its quotes can be copied
@@ -65,7 +66,11 @@ def _inside(_app: object, name: str, source: list[str]) -> None:
         source[0] = re.sub(r"(?<!!)\[([^\]]+)\]\(\.\./[^)]*\)", r"\1", source[0])
 
 
-def setup(app: object) -> None:
+def setup(app: object) -> dict[str, bool]:
     """Sphinx calls this."""
+    for field in PyObject.doc_field_types:
+        if field.name == "variable":
+            field.rolename = ""  # a class's own attribute is no link to one of the same name elsewhere
     app.connect("autodoc-process-docstring", _escape)  # type: ignore[attr-defined]
     app.connect("source-read", _inside)  # type: ignore[attr-defined]
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -89,12 +89,13 @@ def api_pages() -> dict[str, str]:
     for package, names in modules().items():
         lines = [f"# `{package}`", "", "| module | what it does |", "|---|---|"]
         lines += [f"| [{name}](api/{name}.md) | {_first_line(name)} |" for name in names]
-        lines += ["", "```{toctree}", ":hidden:", "", *(f"api/{name}" for name in names), "```", ""]
-        pages[f"api-{package}.md"] = "\n".join(lines)
+        pages[f"api-{package}.md"] = "\n".join([*lines, ""])
         for name in names:
+            # An orphan: a sidebar of every module on every page would be half of the site's build.
+            up = f"---\norphan: true\n---\n\n[`{package}`](../api-{package}.md)\n"
             body = f"```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n```\n"
             title = name.replace(".", ".\u200b")  # a narrow page breaks it there
-            pages[f"api/{name}.md"] = f"# {title}\n\n{body}"
+            pages[f"api/{name}.md"] = f"{up}\n# {title}\n\n{body}"
     return pages
 
 

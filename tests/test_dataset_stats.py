@@ -89,7 +89,7 @@ def test_planted_outliers_are_named():
 
 
 def test_the_page_and_the_command(dataset, drawn, tmp_path, capsys):
-    """The page needs nothing else and shows the very numbers of the JSON, as the text does."""
+    """The page needs nothing else and shows the very numbers of the JSON, errors in mm, as the text does."""
     page = tmp_path / "page.html"
     assert main(["stats", str(dataset), "--html", str(page), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
@@ -109,8 +109,9 @@ def test_the_page_and_the_command(dataset, drawn, tmp_path, capsys):
     text = capsys.readouterr().out
     for split, said in answer["splits"].items():
         for name, q in said["quantities"].items():
-            numbers = [f"{q[k]:.4g}" for k in ("min", "p1", "p50", "p99", "max")]
-            row = [f"{name} [{q['unit']}]", split, f"{q['count']:,}", *numbers]
+            unit, times = ("mm", 1e3) if name == "tof_minus_gt" else (q["unit"], 1)
+            numbers = [f"{times * q[k]:.4g}" for k in ("min", "p1", "p50", "p99", "max")]
+            row = [f"{name} [{unit}]", split, f"{q['count']:,}", *numbers]
             assert "".join(f"<td>{cell}</td>" for cell in row) in html
             assert " ".join(row) in " ".join(text.split())
     for kind in ("mask", "flags"):

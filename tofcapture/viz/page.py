@@ -21,7 +21,10 @@ from numpy.typing import NDArray
 from tofcapture.camera import Camera
 from tofcapture.colours import (
     GOOD,
+    GREY,
+    GROUND_TRUTH,
     MASK,
+    SENSOR,
     Scale,
     UInt8,
     mask_classes,
@@ -130,7 +133,7 @@ METADATA: dict[str, dict[str, None]] = {
 """What matplotlib would write of the day and of itself, by format."""
 
 LINES = ("#2b85c2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-TOF, STEREO, FLANGE = "#e69f00", "#2b85c2", "#8a8a8a"
+TOF, STEREO, FLANGE = ("#{:02x}{:02x}{:02x}".format(*colour) for colour in (SENSOR, GROUND_TRUTH, GREY))
 _INK = "#010203"  # becomes the page's own text colour
 _DOTS = 700  # of a scatter plot; medians use every point
 _SIZE = (5.6, 2.5)  # inches

@@ -53,14 +53,19 @@ def write_stats_page(stats: DatasetStats, path: Path) -> Path:
     return write_page(Path(__file__).with_name("stats.html.j2"), path, content)
 
 
-# What axes say of a quantity, and its unit there in its unit in files: errors are millimetres wherever people look.
 _AXES = {
-    "gt_depth": ("ground truth depth, m", 1.0),
-    "tof_depth": ("ToF depth, m", 1.0),
-    "tof_minus_gt": ("ToF - ground truth, mm", 1e3),
-    "amplitude": ("amplitude, raw units", 1.0),
-    "celsius": ("temperature, degrees Celsius", 1.0),
+    "gt_depth": "ground truth depth, m",
+    "tof_depth": "ToF depth, m",
+    "tof_minus_gt": "ToF - ground truth, mm",
+    "amplitude": "amplitude, raw units",
+    "celsius": "temperature, degrees Celsius",
 }
+_UNITS = {q.name: q.unit for q in QUANTITIES}
+
+
+def _shown(name: str) -> tuple[str, float]:
+    """Return the unit that people read, "" for a share, and what it multiplies: errors are millimetres wherever people look."""
+    return ("mm", 1e3) if name == "tof_minus_gt" else (_UNITS.get(name, ""), 1.0)
 
 
 def quantity_rows(stats: DatasetStats) -> list[list[str]]:
@@ -68,9 +73,9 @@ def quantity_rows(stats: DatasetStats) -> list[list[str]]:
     rows = []
     for split, s in stats.splits.items():
         for name, tally in s.tallies.items():
-            t = tally.table()
-            numbers = [f"{t[k]:.4g}" for k in _ENDS] if t["count"] else ["-"] * len(_ENDS)
-            rows.append([f"{name} [{t['unit']}]", split, f"{t['count']:,}", *numbers])
+            t, (unit, times) = tally.table(), _shown(name)
+            numbers = [f"{times * t[k]:.4g}" for k in _ENDS] if t["count"] else ["-"] * len(_ENDS)
+            rows.append([f"{name} [{unit}]", split, f"{t['count']:,}", *numbers])
     return sorted(rows, key=lambda row: row[0])
 
 
@@ -86,16 +91,13 @@ def bit_rows(stats: DatasetStats) -> list[list[str]]:
 
 def outlier_rows(stats: DatasetStats, most: int = 50) -> list[list[str]]:
     """Rows of view, number, value, median of all, robust standard deviations."""
-    return [
-        [
-            f"{o['scene']} view {o['view']}",
-            o["name"],
-            f"{o['value']:.4g}",
-            f"{o['median']:.4g}",
-            f"{o['deviations']:+.1f}",
-        ]
-        for o in stats.outliers[:most]
-    ]
+    rows = []
+    for o in stats.outliers[:most]:
+        unit, times = _shown(o["name"])
+        named = o["name"] + (f" [{unit}]" if unit else "")
+        numbers = [f"{times * o[k]:.4g}" for k in ("value", "median")]
+        rows.append([f"{o['scene']} view {o['view']}", named, *numbers, f"{o['deviations']:+.1f}"])
+    return rows
 
 
 def _histogram(stats: DatasetStats, quantity: Quantity) -> str:
@@ -110,7 +112,8 @@ def _histogram(stats: DatasetStats, quantity: Quantity) -> str:
     step = (quantity.high - quantity.low) / len(centres)
     span = (low * 0.8, high * 1.2) if quantity.log else (low - 3 * step, high + 3 * step)
     shares = {name: (centres, t.counts / t.counts.sum()) for name, t in found.items()}
-    words, times = _AXES.get(quantity.name, (f"{quantity.name}, {quantity.unit}", 1.0))
+    unit, times = _shown(quantity.name)
+    words = _AXES.get(quantity.name, f"{quantity.name}, {unit}")
     shares = {name: (times * at, share) for name, (at, share) in shares.items()}
     span = (times * span[0], times * span[1])
     return lines(
