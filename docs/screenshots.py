@@ -15,20 +15,28 @@ from pathlib import Path
 PICTURES = Path(__file__).parent / "pictures"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 SHEETS = {"dataset": "view-sheet", "recording": "view-recording", "recording/rig.toml": "view-calibration"}
-RERUN_SECONDS = 30  # until a software renderer has drawn the space
+FIGURES = {"depth": "dataset", "normals": "dataset", "acquisition": "recording", "preprocessing": "recording"}
+RERUN_SECONDS = 60  # until a software renderer has drawn the space
 
 
 def pictures(demo: Path) -> None:
-    """Draw the contact sheets, and photograph Rerun and the report."""
+    """Draw the contact sheets and figures, and photograph Rerun and the report."""
+    from PIL import Image
     from playwright.sync_api import sync_playwright
 
     from tofcapture.cli import main
     from tofcapture.viz.web import page_server
 
     for what, name in SHEETS.items():
-        main(["view", str(demo / what), "--png", str(PICTURES / f"{name}.png"), "--views", "5"])
+        main(["view", str(demo / what), "--png", str(PICTURES / f"{name}.png"), "--views", "3"])
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
-        rrd = Path(folder) / "view.rrd"
+        predictions, rrd = str(Path(folder) / "predictions"), Path(folder) / "view.rrd"
+        main(["predict", str(demo / "dataset"), "--view", "0", "--average", "--out", predictions])
+        for what, of in FIGURES.items():
+            more = ["--prediction", predictions] if of == "dataset" else []
+            main(["figure", what, str(demo / of), *more, "--out", str(PICTURES / f"figure-{what}.png")])
+        plan = ["--dry-run", "--picture", str(PICTURES / "plan.svg")]
+        main(["record", "--scene", "mug", "--out", str(Path(folder) / "mug"), *plan])
         main(["view", str(demo / "dataset"), "--save", str(rrd), "--views", "8"])
         browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         page = browser.new_page(viewport={"width": 1200, "height": 800})
@@ -42,6 +50,9 @@ def pictures(demo: Path) -> None:
         page.wait_for_timeout(1000)
         page.screenshot(path=PICTURES / "report.png")
         browser.close()
+    for name in ("view-calibration", "view-rerun", "report"):  # few colours; a palette would put steps into the others
+        path = PICTURES / f"{name}.png"
+        Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
 
 
 if __name__ == "__main__":

@@ -61,7 +61,8 @@ def _written(source: Source, path: Path, most: int, *, as_sheet: bool = False) -
         shots = write(source, path, most, lambda done, total: report("views", done, total))
     views = len(source.names)
     data = {"title": source.title, "views": views, "shown": shots, "file": str(path)}
-    return Outcome(data, f"{path}: {source.title}, {shots} of {views} views")
+    shown = f", {shots} of {counted(views, 'view')}" if views else ""
+    return Outcome(data, f"{path}: {source.title}{shown}")
 
 
 def _configure_figure(parser: argparse.ArgumentParser) -> None:

@@ -133,7 +133,7 @@ def _planned(args: argparse.Namespace, scene: str, station: Station, plan: Plan)
     workcell = workcell_of(station.config)
     picture = args.picture or args.out.parent / f"{args.out.name}-{scene}-plan.svg"
     target = workcell.board if args.calibration else workcell.target
-    title = f"{scene}: {len(plan.views)} views, {station.arm.describe().model}"
+    title = f"{scene}, {station.arm.describe().model}"
     picture.parent.mkdir(parents=True, exist_ok=True)
     write_plan(plan, workcell, station.rig, target, title, picture)
     proof = _proof(station, plan)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tofcapture.colours import GROUND_TRUTH, SENSOR
 from tofcapture.errors import ConfigError
 from tofcapture.files.seal import replacing
 from tofcapture.poses import Float64, invert
@@ -103,7 +104,10 @@ def _log_shot(rr: Any, stream: Any, shot: Shot, rig: Rig | None) -> None:
 
 
 def _log_cameras(rr: Any, stream: Any, at: str, rig: Rig) -> None:
-    for name, T, camera in (("camera", np.eye(4), rig.tof), ("stereo_camera", rig.T_tof_stereo, rig.stereo)):
+    for name, T, camera, colour in (
+        ("camera", np.eye(4), rig.tof, SENSOR),
+        ("stereo_camera", rig.T_tof_stereo, rig.stereo, GROUND_TRUTH),
+    ):
         _place(rr, stream, f"{at}/{name}", T, static=True)
         stream.log(
             f"{at}/{name}",
@@ -112,6 +116,7 @@ def _log_cameras(rr: Any, stream: Any, at: str, rig: Rig) -> None:
                 principal_point=[camera.cx + 0.5, camera.cy + 0.5],  # Rerun's pixel corners are integers
                 resolution=[camera.width, camera.height],
                 image_plane_distance=_FRUSTUM,
+                color=colour,
             ),
             static=True,
         )
