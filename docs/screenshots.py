@@ -50,7 +50,11 @@ def pictures(demo: Path) -> None:
         page.wait_for_timeout(1000)
         page.screenshot(path=PICTURES / "report.png")
         browser.close()
-    for name in ("view-calibration", "view-rerun", "report"):  # few colours; a palette would put steps into the others
+    for name in (
+        "view-calibration",
+        "view-rerun",
+        "report",
+    ):  # few colours; a palette would put steps into the others
         path = PICTURES / f"{name}.png"
         Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
 

@@ -30,6 +30,8 @@ def test_every_command_stands_in_the_docs_with_its_example():
         assert f"### {name}\n" in page
         assert command.example in page
         assert f"usage: tofcapture {name}" in page
+    for typed, parser in generate._parsers().items():
+        assert "--json" in parser._option_string_actions, typed
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(DOCS)))

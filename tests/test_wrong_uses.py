@@ -79,6 +79,31 @@ predict raw.npy --device gpu                    | 3 | --device gpu: .*try: --dev
 report                                          | 3 | nothing to report.*try: --dataset DIR --results
 report --dataset none                           | 5 | none.*no such file.*try:
 completion powershell                           | 2 | one of bash, .*got 'powershell'
+--verson                                        | 2 | got '--verson'.*try: --version instead
+doctor lab.toml                                 | 2 | nothing is expected .*got 'lab.toml'.*try: tofcapture doctor --help
+record --scene mug --out x --allow-motion yes   | 2 | got 'yes'.*try: tofcapture record --help
+record mug --out x                              | 2 | --scene --calibration is required.*try: tofcapture record
+record --scene "my mug" --out x                 | 3 | 'my mug'.*try: for example: --scene mug-2
+import rec --out x                              | 5 | view-000.h5.*try:
+align mug.h5                                    | 5 | views of the board.*got a file .h5.*try: .*--out RECORDING
+calibrate coverage empty                        | 5 | views of the board.*got another folder.*try: .*--calibration
+build-dataset rec/views/mug --out x             | 5 | got one scene of the recording rec
+build-dataset rec --out rec                     | 3 | a folder of its own, got a recording.*try: --out dataset
+check empty                                     | 5 | neither.*try: give its own folder
+stats data --html x.html extra                  | 2 | got 'extra'.*try: tofcapture stats --help
+view data --scene mug                           | 2 | no option --scene .*try: tofcapture view --help
+view data --views 0                             | 2 | 1 or more, got 0
+figure acquisition data --out x.png             | 5 | a recording with views.*try: tofcapture record
+export-dataset data --format hf --out x         | 2 | ply, .*huggingface, got 'hf'
+train data --out x --lr 0.1                     | 2 | no option --lr .*try: tofcapture train --help
+train rec --out x                               | 5 | a dataset.*got a recording.*try: .*build-dataset
+evaluate mug.h5                                 | 5 | a dataset.*got a file .h5.*try: .*build-dataset
+predict empty --out x                           | 5 | views, shards or arrays, found none.*try: a recording
+predict mug.h5 --view 99                        | 3 | a view of 0 to .*got 99
+export --out m.txt                              | 3 | ends in .onnx, got .txt.*try: --format onnx
+report --results pairs.json                     | 5 | results version 2, got other JSON.*try: tofcapture evaluate
+report --results notes.txt                      | 5 | not JSON.*try: tofcapture evaluate
+demo --out notes.txt                            | 3 | notes.txt: expected a folder.*try: name another folder
 daemon --root notes.txt                         | 3 | notes.txt: expected a folder.*try: name another
 daemon --root empty --http 0.0.0.0:80           | 2 | a loopback address.*try: from another machine: ssh -L
 """

@@ -73,7 +73,7 @@ def recorded_poses(recording: Path) -> tuple[list[Float64], Camera]:
 
     :class:`DataError` where there are no views, or no station.
     """
-    path = Path(recording) / "station.toml"
+    path, views = Path(recording) / "station.toml", calibration_views(recording)
     try:
         workcell = workcell_of(tomllib.loads(path.read_text(encoding="utf-8")))
     except (OSError, tomllib.TOMLDecodeError) as err:
@@ -81,7 +81,7 @@ def recorded_poses(recording: Path) -> tuple[list[Float64], Camera]:
             f"{path}: cannot read where the board stands: {err}", hint="record writes it beside the views"
         ) from err
     T_base_board, poses = board_pose(workcell.board, workcell.board_normal), []
-    for view in map(open_view, calibration_views(recording)):
+    for view in map(open_view, views):
         poses.append(invert(view.arm_before.T_base_flange @ view.rig.T_flange_tof) @ T_base_board)
         camera = view.tof.info.camera
     return poses, camera

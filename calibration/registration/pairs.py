@@ -52,9 +52,10 @@ def calibration_views(recording: Path) -> list[Path]:
     folder = recording / "views" / "calibration"
     found = list(find_views(recording).get(folder.name, ()))
     if not found:
+        to = "RECORDING" if recording.is_file() else recording
         raise DataError(
             f"{recording}: expected a recording with views of the board in {folder}, got {what_is(recording)}",
-            hint=f"tofcapture record --calibration --out {recording}; of imported data: tofcapture import BOARD --scene calibration --out {recording}",
+            hint=f"tofcapture record --calibration --out {to}; of imported data: tofcapture import BOARD --scene calibration --out {to}",
         )
     return found
 

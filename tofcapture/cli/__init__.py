@@ -58,6 +58,10 @@ class _Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> None:  # type: ignore[override]
+        if message.startswith("unrecognized arguments: "):
+            word = message.split()[2]
+            hint = _meant(word, self._option_string_actions, self.prog) if word.startswith("-") else ""
+            raise UsageError(f"nothing is expected after these arguments, got {word!r}", hint=hint)
         chosen = _INVALID_CHOICE.search(message)
         if chosen is None:
             told = _INVALID_VALUE.sub(_expected, message.removeprefix("argument "))
@@ -78,8 +82,9 @@ def _expected(said: re.Match[str]) -> str:
 
 def _meant(got: str, known: Iterable[str], program: str) -> str:
     """Name what is spelt most like ``got``, or where to look."""
-    near = difflib.get_close_matches(got, list(known), n=1)
-    return f"{near[0]} instead; {program} --help lists all" if near else f"{program} --help"
+    words = {word.lstrip("-"): word for word in known}  # dashes are not what makes two names alike
+    near = difflib.get_close_matches(got.lstrip("-"), words, n=1, cutoff=0.7)
+    return f"{words[near[0]]} instead; {program} --help lists all" if near else f"{program} --help"
 
 
 class _Program(_Parser):

@@ -204,6 +204,8 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
     show = subs.add_parser("show", help="say what a rig holds", description="say what a rig holds")
     show.add_argument("camera", metavar="CAMERA", help=f"rig.toml, {_CAMERA}")
     show.add_argument("--size", **size)
+    for sub in subs.choices.values():
+        sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

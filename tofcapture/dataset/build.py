@@ -120,6 +120,8 @@ def build_dataset(
     if not 1 <= index <= count:
         raise ConfigError(f"--part: expected I/N with 1 <= I <= N, got {index}/{count}", hint="--part 2/8")
     check_writable(out, "name another folder: --out")
+    if (out / "views").is_dir():
+        raise ConfigError(f"--out {out}: expected a folder of its own, got a recording", hint="--out dataset")
     folders = [recordings] if isinstance(recordings, str | Path) else recordings
     tasks = scene_tasks(folders, out, rig_path, true_rig=true_rig, config=config)
     mine = [] if finish else tasks[index - 1 :: count]

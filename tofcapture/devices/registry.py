@@ -88,7 +88,10 @@ def make_device(role: str, context: StationContext) -> Any:
     """
     table = context.config.get(role)
     if not isinstance(table, Mapping) or not isinstance(table.get("driver"), str):
-        raise ConfigError(f'station: expected a table [{role}] with driver = "name", got {table!r}')
+        hint = "compare with: tofcapture config show"
+        raise ConfigError(
+            f'station: expected a table [{role}] with driver = "name", got {table!r}', hint=hint
+        )
     name = table["driver"]
     drivers = load_driver(name)
     if role not in drivers:

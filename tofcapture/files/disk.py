@@ -47,11 +47,14 @@ _FOLDERS = {
 def what_is(path: Path) -> str:
     """Say in a word or two what lies there, by its form: a recording, a shard, nothing; for errors."""
     if path.is_dir():
+        if path.resolve().parent.name == "views":
+            return f"one scene of the recording {path.parent.parent}"
         return next((what for name, what in _FOLDERS.items() if (path / name).exists()), "another folder")
     if not path.exists():
         return "nothing"
     if path.suffix == ".h5":
-        return "a shard" if path.parent.name == "shards" else "a view file"
+        named = {"shards": "a shard", "views": "a view file"}
+        return named.get(path.parent.name) or named.get(path.parent.parent.name, "a file .h5")
     return f"a file {path.suffix}".rstrip()
 
 

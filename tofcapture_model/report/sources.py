@@ -64,9 +64,13 @@ def read_sources(
         raise ConfigError("nothing to report", hint="--dataset DIR --results results.json")
     if results is not None and not Path(results).is_file():
         raise DataError(f"{results}: no such file", hint="tofcapture evaluate DATASET --out results.json")
-    scores, no_results = _read_json(results, (FORMAT, VERSION), ("methods", "split"), "--results")
+    scores, no_results = _read_json(
+        results, (FORMAT, VERSION), ("methods", "split"), "--results", "evaluate DATASET --out results.json"
+    )
     keys = ("pairs", "used", "views", "backend", "T_tof_stereo")
-    proof, no_evidence = _read_json(evidence, ("tofcapture-evidence", 1), keys, "--evidence")
+    proof, no_evidence = _read_json(
+        evidence, ("tofcapture-evidence", 1), keys, "--evidence", "align RECORDING"
+    )
     network, no_weights = _read_network(weights)
     absent = {
         "dataset": "" if dataset else "not given, name it with --dataset",
@@ -81,27 +85,25 @@ def read_sources(
 
 
 def _read_json(
-    path: Path | None, kind: tuple[str, int], keys: tuple[str, ...], option: str
+    path: Path | None, kind: tuple[str, int], keys: tuple[str, ...], option: str, writer: str
 ) -> tuple[dict[str, Any] | None, str]:
     """Read one of the project's JSON files; None and a reason where there is none."""
     if path is None:
         return None, f"not given, name it with {option}"
     if not Path(path).is_file():
         return None, f"there is no file {path}"
+    hint = f"tofcapture {writer} writes it"
     try:
         table = json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as err:
-        raise FormatError(f"{path}: not JSON: {err}") from err
+        raise FormatError(f"{path}: not JSON: {err}", hint=hint) from err
     if not isinstance(table, dict) or (table.get("format"), table.get("version")) != kind:
-        got = (
-            f"{table.get('format')} version {table.get('version')}"
-            if isinstance(table, dict)
-            else "no object"
-        )
-        raise FormatError(f"{path}: expected {kind[0]} version {kind[1]}, got {got}", hint="write it again")
+        stated = isinstance(table, dict) and "format" in table
+        got = f"{table['format']} version {table.get('version')}" if stated else "other JSON"
+        raise FormatError(f"{path}: expected {kind[0]} version {kind[1]}, got {got}", hint=hint)
     missing = [k for k in keys if k not in table]
     if missing:
-        raise FormatError(f"{path}: missing {', '.join(missing)}")
+        raise FormatError(f"{path}: missing {', '.join(missing)}", hint=hint)
     return table, ""
 
 
