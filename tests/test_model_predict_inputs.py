@@ -8,6 +8,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -223,9 +224,10 @@ def test_npz_and_capitals_are_read(rig, tmp_path):
     raw = burst_of(SMALL, 1)[0]
     np.savez(tmp_path / "one.npz", anything=raw)
     np.savez_compressed(tmp_path / "named.npz", other=np.zeros(3), raw=raw)
+    np.savez(tmp_path / "other.npz", taps=raw, depth=raw[0], K=np.eye(3))
     (tmp_path / "zip.npy").write_bytes((tmp_path / "one.npz").read_bytes())
     saved(tmp_path / "x.npy", raw).rename(tmp_path / "RAW.NPY")
-    for name in ("one.npz", "named.npz", "zip.npy", "RAW.NPY"):
+    for name in ("one.npz", "named.npz", "other.npz", "zip.npy", "RAW.NPY"):
         np.testing.assert_array_equal(read_input(tmp_path / name, rig=rig).raw[0], raw)
 
 
@@ -239,6 +241,10 @@ DAMAGED = {
     "two.npz": (
         lambda p, raw: np.savez(p, a=raw, b=raw),
         "expected one array, or one that is called raw, got a, b",
+    ),
+    "others.h5": (
+        lambda p, raw: h5py.File(p, "w").create_dataset("raw", data=raw).file.close(),
+        "HDF5 of another program",
     ),
     "none.npz": (lambda p, raw: np.savez(p), "got none"),
     "cut.npz": (_cut, "cannot read the array"),

@@ -45,7 +45,8 @@ NOMINAL_RANGE_ERRORS = (
 """Range errors measured on that sensor; taken for an array without a rig if its two frequencies agree with them only."""
 
 _ARRAYS = (".npy", ".npz")
-_KINDS = "a view file or a shard (.h5), or an array (.npy, .npz)"
+IMPORTED = "tofcapture import reads images, bags, MAT, HDF5 and bytes of cameras; predict takes its recording"
+_KINDS = f"a view file or a shard (.h5), or an array (.npy, .npz); {IMPORTED}"
 
 
 @dataclass(frozen=True)
@@ -98,8 +99,8 @@ def read_input(
     Parameters
     ----------
     path
-        View file or shard (``.h5``), or an array (K, H, W) or (F, K, H, W), ``.npy`` or ``.npz`` with one array or one called
-        ``raw``: counts in the order of the paper's camera, or as ``modulation_hz`` and ``phase_rad`` beside it say.
+        View file or shard (``.h5``), or an array (K, H, W) or (F, K, H, W), ``.npy`` or ``.npz`` with one array, one called
+        ``raw`` or one of so many channels: counts in the order of the paper's camera, or as ``modulation_hz`` and ``phase_rad`` beside it say.
     view
         Of a shard.
     rig, saturation
@@ -124,7 +125,7 @@ def read_input(
         if value is not None:
             raise ConfigError(
                 f"{option} {value}: expected an array ({', '.join(_ARRAYS)}), got {path}",
-                hint="views and shards carry their camera",
+                hint="views and shards carry their camera" if path.suffix.lower() == ".h5" else IMPORTED,
             )
     return _from_h5(path, view)
 
@@ -137,16 +138,24 @@ def from_arrays(
     frame: int | None = None,
 ) -> RawInput:
     """Read a burst from arrays by name, as :func:`read_input` does; ``path`` is what messages call them."""
-    if len(held) != 1 and "raw" not in held:
+    facts = facts_of(held, path)
+    K = len(facts.modulation_hz or PAPER_MODULATION_HZ)
+    like_raw = [n for n, a in held.items() if a.ndim in (3, 4) and K in (a.shape[-3], a.shape[-1])]
+    name = next(
+        (names[0] for names in (["raw"], list(held), like_raw) if len(names) == 1 and names[0] in held), None
+    )
+    if name is None:
         raise DataError(
             f"{path}: expected one array, or one that is called raw, got {', '.join(held) or 'none'}",
             hint="np.savez(path, raw=raw)",
         )
-    raw = held["raw"] if "raw" in held else next(iter(held.values()))
-    raw = raw[None] if raw.ndim == 3 else raw
-    rig = tof_rig(rig_path, (raw.shape[-2], raw.shape[-1]) if raw.ndim > 2 else None) if rig_path else None
+    raw = held[name][None] if held[name].ndim == 3 else held[name]
+    first = (
+        -3 if raw.ndim > 2 and raw.shape[-1] == K != raw.shape[-3] else -2
+    )  # channels that come last are told
+    rig = tof_rig(rig_path, raw.shape[first:][:2] if raw.ndim > 2 else None) if rig_path else None
     camera = rig.tof if rig else NOMINAL_CAMERA
-    plain = _described(facts_of(held, path), camera, saturation, path)
+    plain = _described(facts, camera, saturation, path)
     if rig:
         plain = replace(plain, illuminator=rig.illuminator, range_errors=rig.range_errors, reach=rig.reach)
     expect_shape(raw, plain, path)
@@ -208,6 +217,8 @@ def _from_h5(path: Path, view: int) -> RawInput:
         raise DataError(
             f"cannot read the file: {err.message}", hint=err.hint if path.suffix == ".h5" else _KINDS
         ) from err
+    if not kind.startswith("tofcapture-"):
+        raise DataError(f"{path}: expected a view or a shard, got HDF5 of another program", hint=IMPORTED)
     if kind != "tofcapture-shard":
         found = open_view(path)
         return RawInput(found.tof.raw, found.tof.celsius, found.tof.info, found.rig.tof, str(path))

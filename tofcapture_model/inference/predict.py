@@ -28,7 +28,7 @@ from tofcapture.importing.rules import expect_finite
 from tofcapture_model.config import BASELINES
 from tofcapture_model.data import batched, ends_of, frame_decoder, make_frame, with_cues
 from tofcapture_model.data.conditions import Seen, outside
-from tofcapture_model.data.raw_input import RawInput, from_arrays, read_input, taken
+from tofcapture_model.data.raw_input import IMPORTED, RawInput, from_arrays, read_input, taken
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
 from tofcapture_model.geometry.decoder import Taps, TorchDecoder
 from tofcapture_model.inference.prediction import Prediction, write_prediction
@@ -382,7 +382,7 @@ def sources_of(path: Path, view: int | None = None) -> list[Source]:
         raise DataError(
             f"{path}: expected views, shards or arrays, found none"
             + ("" if view is None else f" of view {view}"),
-            hint="a recording, a dataset, a folder of .npy, .npz or .h5 files, or one such file",
+            hint=f"a recording, a dataset, a folder of .npy, .npz or .h5 files, or one such file; {IMPORTED}",
         )
     stems = [source.name for source in found]
     return [
