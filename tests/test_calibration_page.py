@@ -261,6 +261,10 @@ def test_drift_is_judged_by_size_and_significance():
     old = OldRig("old", exp([0.001, 0, 0, 0, 0, 0]) @ TRUE)
     assert drift(evidence(), old).verdict == "WARN"
     assert "significant" in drift_text(drift(evidence(), old))
+    # Chance exceeds 12.592, the squared sigmas of six numbers, once in twenty times; both rigs have the same sigma.
+    sigma = np.sqrt(2 * uncertainty(evidence())[0][0, 0])
+    edge = OldRig("old", exp([np.sqrt(12.592) * sigma, 0, 0, 0, 0, 0]) @ TRUE)
+    assert drift(evidence(), edge).probability == pytest.approx(0.05, rel=0.02)
     vague = evidence(standard_error={"rotation_deg": 0.5, "translation_mm": 3.0})
     assert drift(vague, old).verdict == "PASS"
 

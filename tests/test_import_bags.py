@@ -292,6 +292,17 @@ def test_a_bag_gives_the_views_of_its_arrays(tmp_path, form, raw):
         np.testing.assert_allclose(view.arm_before.T_base_flange[0, 3], 0.1 * i, atol=1e-9)
 
 
+def test_of_several_cameras_the_one_beside_the_images_is_theirs(tmp_path):
+    """Its topic lies in the folder of the images, though another one comes first and says the same frame."""
+
+    def another(bag):
+        bag.camera("/a/camera_info", START - S, frame="tof", fx=77.0)
+        bag.rows.sort(key=lambda row: row[1])
+
+    for view in imported(written(tmp_path / "mug", change=another), tmp_path / "rec"):
+        assert view.tof.info.camera.fx == TOF["fx"]
+
+
 def test_a_bag_is_its_folder_of_arrays(tmp_path):
     """The same scene as NPY gives identical views, but for times and poses."""
     taps, depths = scenes(3)

@@ -30,7 +30,7 @@ from tofcapture_model.inference.predict import predict
 from tofcapture_model.networks.baselines.coarse_fine import CoarseFine
 from tofcapture_model.networks.checkpoint import load_checkpoint, read_tensors
 from tofcapture_model.training import Group, Run
-from tofcapture_model.training.train import train
+from tofcapture_model.training.train import scheduled_rate, train
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +119,13 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(dataset, tiny, trained, tmp
         strict=True,
     ):
         assert torch.equal(a, b)
+
+
+def test_a_cosine_warms_up_and_falls_from_the_stage_s_rate_to_nothing():
+    """A tenth of it at the start, nearly all after the warm-up, half in the middle, next to nothing at the end."""
+    rates = {p: scheduled_rate(Stage("joint", 1, 0.01), "cosine", p) for p in (0.0, 0.02, 0.5, 1.0)}
+    assert rates == pytest.approx({0.0: 0.001, 0.02: 0.01, 0.5: 0.005, 1.0: 1e-5}, rel=0.02)
+    assert scheduled_rate(Stage("joint", 1, 0.01), "constant", 0.7) == 0.01
 
 
 def test_two_runs_do_not_share_a_folder(dataset, tiny, tmp_path):

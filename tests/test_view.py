@@ -104,6 +104,11 @@ def test_shots_of_a_shard_are_its_arrays(dataset):
     error = by["ToF - ground truth"].values
     assert np.isfinite(error).sum() > 0
     assert shot.T_base_tof.shape == (4, 4)
+    good = by["mask"].values == 0
+    assert (by["ground truth depth"].on_object == good).all()
+    np.testing.assert_array_equal(
+        np.isfinite(error), by["ToF depth"].on_object & np.isfinite(by["ToF depth"].values)
+    )
     assert len(shot.clouds["tof"].points) == np.isfinite(by["ToF depth"].values).sum()
 
 

@@ -12,7 +12,7 @@ import signal
 import socket
 import sys
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 
@@ -148,19 +148,16 @@ async def _show_life(supervisor: Supervisor) -> None:
         await asyncio.sleep(min(period or 5.0, 5.0))
 
 
-def notify(*lines: str) -> bool:
-    """Send lines (``READY=1`` ...) to systemd; false when it did not start us, or does not listen."""
-    where = os.environ.get("NOTIFY_SOCKET")
-    if not where:
-        return False
-    address = "\0" + where[1:] if where.startswith("@") else where
-    try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as link:
+def notify(*lines: str) -> None:
+    """Send lines (``READY=1`` ...) to systemd, where it started us and listens."""
+    if where := os.environ.get("NOTIFY_SOCKET"):
+        address = "\0" + where[1:] if where.startswith("@") else where
+        with (
+            suppress(OSError),
+            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as link,
+        ):
             link.connect(address)
             link.send("\n".join(lines).encode())
-    except OSError:
-        return False
-    return True
 
 
 def watchdog_period() -> float | None:
