@@ -33,7 +33,7 @@ demo: $(STAMP)
 	$(VENV)/bin/tofcapture demo --out demo-out
 
 test: $(STAMP)
-	$(VENV)/bin/python -m pytest -n 2 --dist worksteal
+	$(VENV)/bin/python -m pytest -n 3 --dist worksteal
 
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .

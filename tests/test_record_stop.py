@@ -174,7 +174,7 @@ def test_an_arm_that_somebody_else_holds_is_said(tmp_path, scope, capsys):
     """A process that holds a real arm and does not listen was not stopped."""
     code = (
         "import time; from types import SimpleNamespace as N; from tofcapture.record.resources import hold_arm\n"
-        "with hold_arm(N(simulated=False, describe=lambda: N(model='ur5e', serial='1'))): print(1, flush=True); time.sleep(999)"
+        "with hold_arm(N(simulated=False, by_hand=False, describe=lambda: N(model='ur5e', serial='1'))): print(1, flush=True); time.sleep(999)"
     )
     with child(scope, code, env={**os.environ, "TMPDIR": str(tmp_path)}) as process:
         assert process.stdout.readline()

@@ -166,10 +166,10 @@ def test_what_cannot_be_read_is_not_damaged(tmp_path):
 
 
 def test_a_real_arm_has_one_master(tmp_path, monkeypatch):
-    """Two recorders of two recordings do not move one real arm; of simulated ones there are plenty."""
+    """Two recorders of two recordings do not move one real arm; of simulated ones there are plenty, and people may carry two rigs."""
 
     class Real:
-        simulated = False
+        simulated = by_hand = False
 
         def describe(self):
             return ArmInfo("ur10e", f"serial {os.getpid()} {tmp_path}")
@@ -179,9 +179,11 @@ def test_a_real_arm_has_one_master(tmp_path, monkeypatch):
         pass
     with hold_arm(Real()):
         pass
-    Real.simulated = True
-    with hold_arm(Real()), hold_arm(Real()):
-        pass
+    for kind in ("simulated", "by_hand"):
+        monkeypatch.setattr(Real, kind, True)
+        with hold_arm(Real()), hold_arm(Real()):
+            pass
+        monkeypatch.undo()
 
 
 def _moved(folder):

@@ -107,11 +107,11 @@ def holder(path: Path) -> int | None:
 
 @contextmanager
 def hold_arm(arm: Arm) -> Iterator[None]:
-    """Hold a real arm for this process: two recorders of two recordings must not move it in turn.
+    """Hold a real arm for this process: two recorders of two recordings must not move it in turn. A person's hands are free.
 
     Raises :class:`BusyError`: another process of this machine moves it.
     """
-    if arm.simulated:
+    if arm.simulated or arm.by_hand:
         yield
         return
     info = arm.describe()
