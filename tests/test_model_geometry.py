@@ -133,6 +133,19 @@ def test_propagation_reproduces_a_plane(sign):
     assert (moved - depth).abs().max() < 1e-7
 
 
+def test_propagation_answers_each_image_of_a_batch_by_itself():
+    """Two images together give what each gives alone."""
+    (a, n), (b, m) = (plane(CAMERA, *slopes) for slopes in ((0.5, -0.7), (-0.2, 0.1)))
+    generator = torch.Generator().manual_seed(0)
+    depth = torch.cat([a, b]) + 0.002 * torch.randn((2, *a.shape[1:]), generator=generator).to(a)
+    normals = torch.stack([n, m])[..., None, None].expand(2, 3, *CAMERA.shape)
+    both = propagate_depth(depth, normals, intrinsics(CAMERA).expand(2, -1), torch.ones_like(depth))
+    for k in range(2):
+        one = (x[k : k + 1] for x in (depth, normals))
+        alone = propagate_depth(*one, intrinsics(CAMERA), torch.ones_like(a))
+        torch.testing.assert_close(both[k : k + 1], alone)
+
+
 def test_propagation_denoises_and_respects_jumps():
     """Noise falls by the square root of the voters, and a 5 cm step stays where it is."""
     generator = torch.Generator().manual_seed(1)
