@@ -3,6 +3,7 @@
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from tests.franka_sim import HOME, THERE, FrankaSim, station_file
 from tests.test_files_view import make_view
 from tofcapture.cli import main
 from tofcapture.devices import faults, registry
-from tofcapture.devices.arm.franka import FrankaArm, fr3
+from tofcapture.devices.arm.franka import FrankaArm, FrankaLink, fr3
 from tofcapture.devices.kinematics import forward, inverse_all
 from tofcapture.devices.registry import StationContext
 from tofcapture.devices.station import open_station, read_station
@@ -76,6 +77,46 @@ def test_absent(tmp_path):
     with pytest.raises(faults.ControllerSilent, match="port 1337"), driver(tmp_path, "127.0.0.199"):
         pass
     assert time.monotonic() - begun < SOON
+
+
+class _Told(FrankaLink):
+    """The connection over states that are told, one a look: shares of speeds and accelerations that are still commanded."""
+
+    def __init__(self, *commanded):
+        self._host, self._newest, self._commanded = "told", 0.0, iter(commanded)
+        most = SimpleNamespace(get=lambda: np.full(7, 5.0))
+        self.robot = SimpleNamespace(state=None, joint_acceleration_limit=most)
+
+    def _state(self):
+        dq, ddq = next(self._commanded)
+        self._newest += 0.5
+        self.robot.state = SimpleNamespace(q_d=HOME, dq_d=dq * AHEAD, ddq_d=ddq * AHEAD)
+        return self.robot.state
+
+    def sample(self):
+        return SimpleNamespace(timestamp=self._newest)
+
+
+AHEAD = np.array([0.5, 0.0, 0.0, -1.0, 0.0, 0.0, 0.1])
+
+
+def test_a_move_begins_at_rest():
+    """It waits until neither speed nor acceleration is commanded; what stays is named."""
+    link = _Told((0.3, 0.0), (0.0, 0.5), (0.0, 0.0), (0.3, 0.0))
+    link.rest()
+    assert link._newest == 1.5
+    with pytest.raises(faults.NotSettled, match="still commanded"):
+        _Told(*[(0.3, 0.0)] * 9).rest()
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.2, 1.0])
+def test_a_stop_is_ahead_on_the_way(speed):
+    """The arm is told to rest where braking takes it, no joint beside its way; one at rest stays."""
+    link = _Told((speed, 0.0))
+    link._state()
+    way = link.brake() - HOME
+    assert way == pytest.approx(-way[3] * AHEAD)
+    assert -way[3] == pytest.approx(speed**2 / 10 + 0.02 * speed, rel=0.2)
 
 
 @pytest.fixture(scope="module")

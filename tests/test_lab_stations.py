@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from tests import (
-    test_arducam_driver,
-    test_espros_driver,
-    test_femto_driver,
-    test_genicam_driver,
-    test_realsense_driver,
-)
+from tests import test_arducam_driver, test_femto_driver, test_genicam_driver
 from tests.espros_emulator import Emulator
 from tests.still_station import CAMERA
 from tofcapture.camera import Camera
@@ -78,7 +72,9 @@ def test_arducam(tmp_path):
 
 def test_realsense(tmp_path):
     """A bag that the library recorded."""
-    make, other, file = test_realsense_driver, test_arducam_driver, tmp_path / "frames.raw"
+    from tests import test_realsense_driver as make
+
+    other, file = test_arducam_driver, tmp_path / "frames.raw"
     file.write_bytes(other.frames("b0410", other.wall("b0410", 1.5), 9))
     camera = make.Emulated()
     make.write_bag(tmp_path / "wall.db3", camera)
@@ -98,9 +94,11 @@ def test_femto(tmp_path):
     assert view.tof.raw.shape == (2, 9, 512, 512)
 
 
-def test_espros(tmp_path, monkeypatch):
+def test_espros(tmp_path):
     """The vendor's client at its own ports."""
+    from tests.test_espros_driver import TABLE
+
     wall = 1.5 * np.linalg.norm(CAMERA.unproject(np.ones(CAMERA.shape)), axis=-1)
     with Emulator(wall, ports=(50660, 45454)):
-        view = recorded(tmp_path, {"driver": "espros", **test_espros_driver.TABLE}, CAMERA)
+        view = recorded(tmp_path, {"driver": "espros", **TABLE}, CAMERA)
     assert view.tof.raw.shape == (2, 8, 240, 320)
