@@ -219,7 +219,10 @@ def follow(
         check()
         sample = link.sample()
         if (off := _off_way(sample.joints - start.joints, goal - start.joints)) > _ASTRAY:
-            raise ProgramStopped(f"the arm left the way that was checked, by {np.degrees(off):.1f} deg")
+            raise ProgramStopped(
+                f"the arm left the way that was checked, by {np.degrees(off):.1f} deg",
+                hint="was it pushed, guided or driven by another program? look at the arm, then start again",
+            )
         link.kick_seeing()
         left = float(np.abs(sample.joints - goal).max())
         there = there + 1 if left < near else 0
