@@ -369,6 +369,12 @@ def wrong(folder):
             "only one of them for hf, lf", "020MHz"
         ),
         "a TIFF that OpenCV does not read": (lambda: none(put(d=None), (folder / "depth_0.tif").write_bytes(b"II*\0")), "depth_0.tif", "np.save"),
+        "phases begun half a turn later": (lambda: put(3000 - raw), "agrees with the ToF image", "phase_deg = [180.0, 270.0, 0.0, 90.0, 180.0"),
+        "hertz": (lambda: put(tof={**TOF, "modulation_mhz": [20e6] * 8, "phase_deg": [0, 90, 180, 270] * 2}), "expected megahertz", "write 20"),
+        "phases in radians": (lambda: put(tof={**TOF, "modulation_mhz": [20] * 8, "phase_deg": list(THETA)}), "expected degrees", "90.0, 180.0"),
+        "a pattern of other names": (lambda: put(raw_={"files": "tof_*.npy"}), "files = 'tof_*.npy'", "raw_*.npy"),
+        "a transposed transform": (lambda: put(truth={"T_tof_truth": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0.1, 0, 0, 1]]}), "last row", "transposed"),
+        "poses that are not there": (lambda: put(poses={"file": "gt.txt"}), "no such file of poses", "SOURCE"),
         "a kind of nobody": (lambda: put(truth={"kind": "disparity"}), "kind", ""),
         "poses too few": (lambda: _poses(folder, put, "0 0 0 0 0 0 1\n"), "a pose for each of 3 views, got 1", "one line"),
         "quaternion that is none": (lambda: _poses(folder, put, "0 0 0 1 2 3 4\n" * 3), "unit quaternion", "order"),
@@ -419,7 +425,7 @@ def test_one_frequency_does_not_tell_which_way_its_phases_run(tmp_path):
     np.save(tmp_path / "depth_0.npy", depth[0])
     with pytest.raises(TofError, match="mm off") as info:
         import_data([tmp_path], tmp_path / "rec", Said(tof=turned))
-    assert "here the other way, phase_deg = [0.0, 90.0, 180.0, 270.0]" in info.value.hint
+    assert "phase_deg = [0.0, 90.0, 180.0, 270.0]" in info.value.hint
     right = {**turned, "phase_deg": [0, 90, 180, 270]}
     assert import_data([tmp_path], tmp_path / "rec", Said(tof=right)).warnings == []
 

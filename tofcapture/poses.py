@@ -35,7 +35,21 @@ def check_transform(T: ArrayLike, name: str = "transform") -> Float64:
             hint="translations are in metres; the rotation must not hold a scale",
         )
     if np.abs(out[3] - [0, 0, 0, 1]).max() > 1e-9:
-        raise ConfigError(f"{name}: expected last row 0 0 0 1, got {out[3].tolist()}")
+        raise ConfigError(
+            f"{name}: expected last row 0 0 0 1, got {out[3].tolist()}",
+            hint="the last column has the translation: is it transposed?",
+        )
+    return out
+
+
+def printed(T: ArrayLike) -> Float64:
+    """Give a (4, 4), or its 16 numbers by rows, back the rotation that a few printed digits took; what is off by more stays."""
+    out = np.array(T, dtype=np.float64)
+    out = out.reshape(4, 4) if out.size == 16 else out
+    if out.shape == (4, 4) and np.isfinite(out).all():
+        U, _, V = np.linalg.svd(out[:3, :3])
+        if np.abs(U @ V - out[:3, :3]).max() < 1e-3:
+            out[:3, :3] = U @ V
     return out
 
 

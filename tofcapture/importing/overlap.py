@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from tofcapture.channels import SPEED_OF_LIGHT
 from tofcapture.errors import DataError
-from tofcapture.frames import NO_TRUTH, View
-from tofcapture.importing.rules import Float32, sign_unknown
+from tofcapture.frames import NO_TRUTH, TofInfo, View
+from tofcapture.importing.rules import Float32
 from tofcapture.ops.phase import Decoder
 from tofcapture.poses import Float64, transform_points
 
 _WRONG = 0.03  # m of median difference from which a better reading is looked for
 _BETTER = 3.0  # times smaller differences of another reading
 _FAR_OFF = 0.25  # m of median difference that is told
+_SPARSE = 0.05  # of the pixels; less is told
 _LEAST = 0.01  # of the pixels
 
 
@@ -64,6 +65,9 @@ def compare(view: View, where: str, model: str, *, placed: bool = True) -> Overl
             f"{where}: expected ground truth that agrees with the ToF image, it is {1e3 * off:.0f} mm off",
             better,
         )
+    if found.share < _SPARSE:
+        text = f"{where}: ground truth and ToF have {found.share:.1%} of the image in common: build-dataset may find no surface there"
+        return replace(found, warnings=(text,))
     if off > _FAR_OFF:
         text = f"{where}: ground truth and ToF depth differ by {1e3 * off:.0f} mm in the median: are channels, unit and T_tof_truth right?"
         return Overlap(tof, truth, decoded.confidence, model, (text,))
@@ -88,11 +92,22 @@ def _better(tof: Float32, truth: Float32, view: View, off: float) -> str:
     if truth.shape[0] == truth.shape[1]:
         readings['rows and columns have changed places: [truth] axes = "WH" in import.toml'] = truth.T
     scores = {words: float(np.nanmedian(np.abs(t - tof))) for words, t in readings.items()}
-    if turned := sign_unknown(view.tof.info):
-        reach = SPEED_OF_LIGHT / 2 / view.tof.info.modulation_hz[0]
-        other = (reach - tof * lengths) / lengths
-        scores[turned.replace("if near comes out far", "here the other way")] = float(
-            np.nanmedian(np.abs(truth - other))
-        )
+    for info in _other_phases(view.tof.info):
+        depth = Decoder(info).burst(view.tof.raw, float(np.mean(view.tof.celsius))).depth
+        score = float(np.nanmedian(np.abs(truth - depth)))
+        if score < _WRONG:
+            degrees = [round(float(d), 3) for d in np.degrees(info.phase_rad) % 360]
+            scores[
+                f"the phases run the other way or begin elsewhere: [tof] phase_deg = {degrees} in import.toml"
+            ] = score
     words = min(scores, key=lambda w: scores[w])
     return words if scores[words] * _BETTER < off else ""
+
+
+def _other_phases(info: TofInfo) -> Iterator[TofInfo]:
+    """List what the phases of all channels may be where no frame can tell: the other way round, and begun a quarter later."""
+    for sign in (1, -1):
+        for start in range(4):
+            if (sign, start) != (1, 0):
+                phases = [(sign * p + start * np.pi / 2) % (2 * np.pi) for p in info.phase_rad]
+                yield replace(info, phase_rad=tuple(phases))

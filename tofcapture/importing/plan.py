@@ -137,6 +137,7 @@ def plan(source: Path, said: Said) -> list[Planned]:
     message says what to write into ``import.toml``.
     """
     named = [_named(p, said) for p in find_pieces(source, said)]
+    _expect_matches(named, said, source)
     if not any(n.role == "raw" for n in named):
         # Names that say nothing are raw, unless others say that they are.
         named = [replace(n, role="raw") if n.role == "" else n for n in named]
@@ -146,7 +147,9 @@ def plan(source: Path, said: Said) -> list[Planned]:
     if not raw:
         raise DataError(
             f"{source}: expected raw arrays, found only {_some([n.piece.name for n in named])}",
-            hint='say which are raw: [raw] files = "..." in import.toml, or call them raw-000.npy ...',
+            hint="name the folder that has both: tofcapture import FOLDER"
+            if source.is_file()
+            else 'say which are raw: [raw] files = "..." in import.toml, or call them raw-000.npy ...',
         )
     truth = _scenes([n for n in named if n.role == "truth"], said, source)
     if said.truth.get("kind") == "none":
@@ -163,6 +166,18 @@ def plan(source: Path, said: Said) -> list[Planned]:
         views = _views(found, truth.get(scene, []), said, channels, size, source)
         out += [replace(v, scene=check_scene_name(scene), index=i) for i, v in enumerate(views)]
     return _posed(out, said, source)
+
+
+def _expect_matches(named: list[_Named], said: Said, source: Path) -> None:
+    """Refuse a pattern of files that none has; a bag's topics are looked for by their reader."""
+    for role, table in (("raw", said.raw), ("truth", said.truth)):
+        free = [n for n in named if not n.piece.role]
+        if "files" in table and free and not any(n.role == role for n in named):
+            like = next((n for n in free if not n.role), free[0]).piece.name
+            raise DataError(
+                f"{source}: expected files as [{role}] files = {table['files']!r} says, got {_some([n.piece.name for n in free])}",
+                hint=f'a pattern of their names: [{role}] files = "{re.sub(r"[0-9]+", "*", like)}"',
+            )
 
 
 def _expect_alike(pieces: list[Piece], source: Path) -> None:
@@ -194,7 +209,7 @@ def _tell_unnamed(names: list[str], source: Path) -> None:
 def _posed(views: list[Planned], said: Said, source: Path) -> list[Planned]:
     """Give views the poses that ``[poses] file`` has."""
     path = (source if source.is_dir() else source.parent) / str(said.poses.get("file", ""))
-    if said.poses.get("file") and (path.is_file() or not all(v.T_world_tof is not None for v in views)):
+    if said.poses.get("file") and (path.exists() or not all(v.T_world_tof is not None for v in views)):
         stamps, poses = read_poses(path, said)
         where = str(path)
     else:

@@ -16,7 +16,7 @@ from tofcapture.importing.readers.arrays import SUFFIXES, arrays_of
 from tofcapture.importing.said import Said
 from tofcapture.importing.source import natural
 from tofcapture.meshes import UNITS
-from tofcapture.poses import Float64, check_transform, exp, invert, log, transform
+from tofcapture.poses import Float64, check_transform, exp, invert, log, printed, transform
 
 _APART = 0.1  # s that a pose may be away from the frame that it is taken for
 _UNITS_OF_TIME = (1.0, 1e-3, 1e-6, 1e-9)  # s, ms, us, ns; the one in which poses and frames meet is taken
@@ -66,6 +66,10 @@ def read_poses(path: Path, said: Said) -> tuple[Float64 | None, Float64]:
 
 def _rows(path: Path) -> tuple[Rows, str]:
     """Rows of numbers in our order, and the unit of the places where a header says it."""
+    if not path.exists():
+        raise DataError(
+            f"{path}: no such file of poses", hint="[poses] file is looked for in SOURCE, or beside it"
+        )
     try:
         if path.is_dir():
             files = sorted((p for p in path.iterdir() if p.is_file()), key=lambda p: natural(p.name))
@@ -206,11 +210,8 @@ def _pose(row: Float64, scale: float, where: str) -> Float64:
         return transform(R, row[:3] * scale)
     T = np.eye(4)
     T[:3] = row[:12].reshape(3, 4)
-    U, _, V = np.linalg.svd(T[:3, :3])
-    if np.abs(U @ V - T[:3, :3]).max() < 1e-3:  # what is left of printing a few digits
-        T[:3, :3] = U @ V
     T[:3, 3] *= scale
-    return check_transform(T, where)
+    return check_transform(printed(T), where)
 
 
 def poses_of(

@@ -17,9 +17,10 @@ from tofcapture.errors import ConfigError
 from tofcapture.frames import PAPER_MODULATION_HZ, PAPER_PHASE_RAD, TofInfo
 from tofcapture.importing.rules import SATURATION
 from tofcapture.meshes import metres_per
-from tofcapture.poses import Float64, check_transform
+from tofcapture.poses import Float64, check_transform, printed
 from tofcapture.rig import camera_from, camera_table
 
+_FASTEST = 10e9  # Hz, beyond which nobody modulates light
 KINDS = ("depth", "radial", "points", "mesh", "none")
 NAME = "import.toml"
 _TOF = (
@@ -97,6 +98,16 @@ class Said:
                 f"{self.where}: [tof]: expected a phase for each modulation frequency, got {len(hz)} and {len(phases)}",
                 hint="modulation_mhz = [20, 20, 20, 20], phase_deg = [0, 90, 180, 270]",
             )
+        if max(hz) > _FASTEST:
+            raise ConfigError(
+                f"{self.where}: [tof] modulation_mhz: expected megahertz, got {max(hz) / 1e6:g}",
+                hint=f"of hertz write {max(hz) / 1e12:g}",
+            )
+        if 0 < max(self.tuple_of("tof", "phase_deg"), default=0.0) <= 2 * np.pi:
+            raise ConfigError(
+                f"{self.where}: [tof] phase_deg: expected degrees, got {self.tof['phase_deg']}",
+                hint=f"of radians write {[round(float(d), 3) for d in np.degrees(self.tof['phase_deg'])]}",
+            )
         return hz, phases
 
     def size(self, facts: Facts) -> tuple[int, int] | None:
@@ -135,7 +146,7 @@ class Said:
     def transform(self, name: str) -> Float64 | None:
         """Read a transform of ``[truth]``; ``None`` when it is not said."""
         said = self.truth.get(name)
-        return None if said is None else check_transform(said, f"{self.where}: [truth] {name}")
+        return None if said is None else check_transform(printed(said), f"{self.where}: [truth] {name}")
 
     def truth_camera(self) -> Camera | None:
         """Read ``[truth.camera]``; ``None`` when it is not said."""
@@ -154,10 +165,13 @@ class Said:
 def read_said(path: Path) -> Said:
     """Read an ``import.toml``; :class:`ConfigError` for one that cannot be read, or has keys that nobody knows."""
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
         raise ConfigError(
-            f"{path}: cannot read it: {err}", hint="tofcapture import --guess SOURCE writes one"
+            f"{path}: cannot read it: {err}",
+            hint="save it as UTF-8"
+            if isinstance(err, UnicodeDecodeError)
+            else "tofcapture import --guess SOURCE writes one",
         ) from err
     _known(table, (*_KEYS, "scene"), str(path))
     for name, known in _KEYS.items():

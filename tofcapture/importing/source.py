@@ -141,5 +141,6 @@ def _paths(source: Path, readers: list[Reader]) -> Iterator[Path]:
         ours = (
             path.name in {"import.toml", "import.png"} or (path / "rig.toml").is_file()
         )  # a recording that lies inside
-        if not path.name.startswith(".") and not ours:
+        circle = path.is_symlink() and source.resolve().is_relative_to(path.resolve())
+        if not path.name.startswith(".") and not ours and not circle:
             yield from _paths(path, readers)

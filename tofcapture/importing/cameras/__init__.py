@@ -7,6 +7,7 @@ Read are Kalibr's camchain, ROS's CameraInfo (YAML or echoed), OpenCV's FileStor
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -76,10 +77,11 @@ def camera_keys(text: str) -> dict[str, Any]:
     if Path(file).exists():
         return keys_of_file(Path(file), name)
     try:
-        numbers = [float(n) for n in text.replace(";", ",").split(",")]
+        numbers = [float(n) for n in re.split(r"[,;\s]+", text.strip())]
     except ValueError as err:
         raise ConfigError(
-            f"--camera: expected fx,fy,cx,cy[,k1,k2,p1,p2,k3] or a file, got {text!r}",
+            f"--camera: expected fx,fy,cx,cy[,k1,k2,p1,p2,k3] or a file, got {text!r}"
+            + (", which is not there" if re.search("[A-Za-z]{2}", text) else ""),
             hint="--camera 190.6,200.8,116.8,101.5",
         ) from err
     if len(numbers) < 4:
