@@ -36,7 +36,7 @@ autodoc_mock_imports = generate.ABSENT
 
 exclude_patterns = ["_build"]
 nitpicky = False
-# A property's first words up to a colon are taken for its type, "unit" or "frames" among them; classes have attributes so named.
+# An error that another module hands on is offered under both names; either leads there.
 suppress_warnings = ["ref.python"]
 
 smartquotes = False  # a command with its quotes can be copied
@@ -51,9 +51,18 @@ html_show_sourcelink = False
 generate.write_all(HERE / "reference")
 
 
+_COLON = "\ue000"
+
+
+def _keep_colons(_app: object, what: str, _name: str, _thing: object, _options: object, lines: list[str]) -> None:
+    """Hide the colons of attributes from napoleon, which takes the words before the first for a type."""
+    if what in {"attribute", "data", "property"}:
+        lines[:] = [line.replace(":", _COLON) for line in lines]
+
+
 def _escape(_app: object, _what: str, _name: str, _thing: object, _options: object, lines: list[str]) -> None:
     """In our docstrings ``|x|`` is a length or a number's size, never reStructuredText's substitution."""
-    for i, line in enumerate(lines):
+    for i, line in enumerate(line.replace(_COLON, ":") for line in lines):
         parts = re.split(r"(``.*?``)", line)
         plain = "".join(p if p.startswith("``") else p.replace("|", r"\|") for p in parts)
         # ``low, high`` are two names; Sphinx would take the first for the type of the second.
@@ -66,11 +75,11 @@ def _inside(_app: object, name: str, source: list[str]) -> None:
         source[0] = re.sub(r"(?<!!)\[([^\]]+)\]\(\.\./[^)]*\)", r"\1", source[0])
 
 
-def setup(app: object) -> dict[str, bool]:
+def setup(app: object) -> None:
     """Sphinx calls this."""
     for field in PyObject.doc_field_types:
         if field.name == "variable":
             field.rolename = ""  # a class's own attribute is no link to one of the same name elsewhere
+    app.connect("autodoc-process-docstring", _keep_colons, priority=400)  # type: ignore[attr-defined]
     app.connect("autodoc-process-docstring", _escape)  # type: ignore[attr-defined]
     app.connect("source-read", _inside)  # type: ignore[attr-defined]
-    return {"parallel_read_safe": True, "parallel_write_safe": True}

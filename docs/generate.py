@@ -103,7 +103,8 @@ def _first_line(module: str) -> str:
     path = ROOT / module.replace(".", "/")
     path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
     text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-    return text.partition("\n")[0].replace("``", "`").replace("|", "\\|")
+    line = re.sub(r":\w+:`", "`", text.partition("\n")[0])
+    return line.replace("``", "`").replace("|", "\\|")
 
 
 def write_all(folder: Path) -> None:
