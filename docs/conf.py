@@ -54,7 +54,9 @@ generate.write_all(HERE / "reference")
 _COLON = "\ue000"
 
 
-def _keep_colons(_app: object, what: str, _name: str, _thing: object, _options: object, lines: list[str]) -> None:
+def _keep_colons(
+    _app: object, what: str, _name: str, _thing: object, _options: object, lines: list[str]
+) -> None:
     """Hide the colons of attributes from napoleon, which takes the words before the first for a type."""
     if what in {"attribute", "data", "property"}:
         lines[:] = [line.replace(":", _COLON) for line in lines]
