@@ -341,6 +341,7 @@ def wrong(folder):
         "depth as EXR": (lambda: none(put(d=None), (folder / "depth_0.exr").write_bytes(b"v/1")), "got depth_0.exr", "np.save"),
         "depth marked by -1": (lambda: put(d=np.where(depth > 1, -1, depth)), "behind it", "missing = [-1]"),
         "depth along the rays": (lambda: put(d=depth * _rays()), "mm off", 'kind = "radial"'),
+        "depth in steps of 0.2 mm": (lambda: put(d=np.rint(5000 * depth), truth={"unit": "mm"}), "mm off", "steps of 0.2 mm"),
         "depth in feet": (lambda: put(d=depth / 0.3048), "mm off", "inches or feet"),
         "points with y up": (
             lambda: put(d=depth[..., None] * _rays(points=True) * [1, -1, 1], truth={"T_tof_truth": identity}), "fy -46", "y runs the other way"
@@ -372,6 +373,7 @@ def wrong(folder):
         "phases begun half a turn later": (lambda: put(3000 - raw), "agrees with the ToF image", "phase_deg = [180.0, 270.0, 0.0, 90.0, 180.0"),
         "hertz": (lambda: put(tof={**TOF, "modulation_mhz": [20e6] * 8, "phase_deg": [0, 90, 180, 270] * 2}), "expected megahertz", "write 20"),
         "phases in radians": (lambda: put(tof={**TOF, "modulation_mhz": [20] * 8, "phase_deg": list(THETA)}), "expected degrees", "90.0, 180.0"),
+        "a camera that is no camera": (lambda: put(truth={"camera": [45, 46, 19, 15]}), "expected a table", "FILE#NAME"),
         "a pattern of other names": (lambda: put(raw_={"files": "tof_*.npy"}), "files = 'tof_*.npy'", "raw_*.npy"),
         "a transposed transform": (lambda: put(truth={"T_tof_truth": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0.1, 0, 0, 1]]}), "last row", "transposed"),
         "poses that are not there": (lambda: put(poses={"file": "gt.txt"}), "no such file of poses", "SOURCE"),

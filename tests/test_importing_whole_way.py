@@ -192,6 +192,18 @@ def test_depth_of_a_second_camera_lies_where_its_transform_says(tmp_path):
     said = Said(tof=TOF, truth={"camera": camera, "T_tof_truth": T_tof_truth.tolist()})
     from tofcapture.importing.plan import plan
 
-    _, overlap = make_view(plan(tmp_path, said)[0], said)
-    assert overlap.share > 0.7
-    assert abs(overlap.difference) < 2e-3
+    pixels = [TOF[k] for k in ("fx", "fy", "cx", "cy")]
+    one = {
+        "camera_model": "pinhole",
+        "intrinsics": pixels,
+        "distortion_coeffs": [],
+        "resolution": SHAPE[::-1],
+    }
+    chain = {"tof": one, "second": {**one, "T_cn_cnm1": invert(T_tof_truth).tolist()}}
+    (tmp_path / "camchain.yaml").write_text(json.dumps(chain))
+    of_chain = Said(str(tmp_path / "import.toml"), tof=TOF, truth={"camera": "camchain.yaml#second"})
+    for told in (said, of_chain):
+        view, overlap = make_view(plan(tmp_path, told)[0], told)
+        np.testing.assert_allclose(view.rig.T_tof_stereo, T_tof_truth, atol=1e-9)
+        assert overlap.share > 0.7
+        assert abs(overlap.difference) < 2e-3

@@ -17,6 +17,7 @@ from tofcapture.poses import Float64, transform_points
 _WRONG = 0.03  # m of median difference from which a better reading is looked for
 _BETTER = 3.0  # times smaller differences of another reading
 _FAR_OFF = 0.25  # m of median difference that is told
+_STEPS = (0.1, 0.125, 0.2, 0.25, 0.5)  # mm, of integers that other cameras and datasets write
 _SPARSE = 0.05  # of the pixels; less is told
 _LEAST = 0.01  # of the pixels
 
@@ -89,6 +90,9 @@ def _better(tof: Float32, truth: Float32, view: View, off: float) -> str:
         'it is along the rays: [truth] kind = "radial" in import.toml': truth / lengths,
         'it is in inches or feet: convert it, and say [truth] unit = "m"': truth * 0.3048,
     }
+    for step in _STEPS:
+        text = f"it is in steps of {step:g} mm: multiply it by {step:g}, and say [truth] unit = 'mm'"
+        readings[text] = truth * step
     if truth.shape[0] == truth.shape[1]:
         readings['rows and columns have changed places: [truth] axes = "WH" in import.toml'] = truth.T
     scores = {words: float(np.nanmedian(np.abs(t - tof))) for words, t in readings.items()}

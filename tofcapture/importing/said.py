@@ -151,6 +151,11 @@ class Said:
     def truth_camera(self) -> Camera | None:
         """Read ``[truth.camera]``; ``None`` when it is not said."""
         said = self.truth.get("camera")
+        if said is not None and not isinstance(said, Mapping):
+            raise ConfigError(
+                f"{self.where}: [truth] camera: expected a table, got {said!r}",
+                hint='camera = "fx,fy,cx,cy", "FILE#NAME" as of --camera, or { width = 640, height = 480, fx = 600, ... }',
+            )
         return None if said is None else camera_from(said, f"{self.where}: [truth.camera]")
 
     def tuple_of(self, table: str, key: str, scale: float = 1.0) -> tuple[float, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,16 @@ from tofcapture.camera import Camera, distorted
 from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.layout import BOARD_SCENE
 from tofcapture.frames import NO_TRUTH
+from tofcapture.importing.cameras import camera_keys, cameras_of
 from tofcapture.importing.plan import Planned
 from tofcapture.importing.rules import FARTHEST, NEAREST, Float32, metres
 from tofcapture.importing.said import Said
 from tofcapture.libraries import load_open3d
 from tofcapture.meshes import UNITS
 from tofcapture.poses import Float64, invert, transform_points
+from tofcapture.rig import camera_from
 
+_SAME = 0.5  # px between intrinsics of one camera
 _GRID = 0.5  # px that a point map may be off the pinhole that fits it
 _ELSE = (
     "views of the calibration board find it: import them first, --scene calibration, then tofcapture align"
@@ -64,16 +68,14 @@ def point_map(view: Planned, said: Said, tof: Camera, T_tof_stereo: Float64 | No
         kind = (
             "points" if values.ndim == 3 and values.shape[-1] == 3 and values.dtype.kind == "f" else "depth"
         )
+    camera, chained = _second(said, tof, values.shape)
+    camera = camera or view.truth_facts.camera
     T = said.transform("T_tof_truth")
     T = view.T_tof_truth if T is None else T
-    T = (
-        T_tof_stereo
-        if T is None and (said.truth_camera() or view.truth_facts.camera or kind == "points")
-        else T
-    )
+    T = chained if T is None else T
+    T = T_tof_stereo if T is None and (camera or kind == "points") else T
     unit = str(said.truth.get("unit", "") or view.truth_facts.unit)
     missing = said.tuple_of("truth", "missing")
-    camera = said.truth_camera() or view.truth_facts.camera
     placed = T is not None or view.scene != BOARD_SCENE or (camera is None and kind != "points")
     T = T if placed else np.eye(4)
     if kind == "points":
@@ -82,6 +84,22 @@ def point_map(view: Planned, said: Said, tof: Camera, T_tof_stereo: Float64 | No
         depth = metres(values, unit, missing, where)
         found = _of_depth(depth, kind == "radial", camera, T, tof, where)
     return replace(found, placed=placed)
+
+
+def _second(said: Said, tof: Camera, shape: tuple[int, ...]) -> tuple[Camera | None, Float64 | None]:
+    """Read ``[truth] camera``: a table, ``fx,fy,cx,cy`` or ``FILE#NAME``; and (4, 4) to the ToF camera, where that is the file's first."""
+    told = said.truth.get("camera")
+    if not isinstance(told, str):
+        return said.truth_camera(), None
+    file, _, name = told.partition("#")
+    beside = Path(said.where).parent / file
+    path = beside if beside.exists() else Path(file)
+    keys = camera_keys(f"{path}#{name}" if name else str(path))
+    camera = camera_from({"height": shape[0], "width": shape[1], **keys}, f"{said.where}: [truth] camera")
+    found = cameras_of(path) if name else {}
+    first = next((one.keys for one in found.values()), {})
+    ours = all(abs(first.get(k, np.inf) - getattr(tof, k)) < _SAME for k in ("fx", "fy", "cx", "cy"))
+    return camera, found[name].T if ours and name in found else None
 
 
 def _is_map(points: NDArray[Any], view: Planned, said: Said) -> bool:
