@@ -32,7 +32,7 @@ STATION = """
 [arm]
 driver = "carried"
 hold = 1.0
-patience = 30.0
+patience = 12.0
 [tof]
 driver = "carried"
 [stereo]
@@ -172,7 +172,7 @@ def test_a_person_who_gives_up_ends_the_run_and_it_goes_on_later(carried, tmp_pa
     """A rig that never rests, or never leaves the view before, ends the run by name; the same command goes on."""
     rng = np.random.default_rng(1)
     path, person = carried([at()] * 6 + [at(*rng.normal(0, 30, 3)) for _ in range(90)])
-    with open_station(path) as station, pytest.raises(Stopped, match="did not stand still within 30 s"):
+    with open_station(path) as station, pytest.raises(Stopped, match="did not stand still within 12 s"):
         record(station, "mug", tmp_path / "rec", views=2, frames=2)
     person.script, person.looks = [at(y=90)] * 9, 0
     with open_station(path) as station:
@@ -261,7 +261,7 @@ def test_the_commands(carried, tmp_path, capsys):
 def test_a_tripod_with_simulated_cameras(tmp_path):
     """The command records through the driver as it is registered, real time and all."""
     path, out = tmp_path / "station.toml", tmp_path / "rec"
-    text = STATION.replace("patience = 30.0\n", "").replace('"carried"\nhold', '"tripod"\nhold')
+    text = STATION.replace("patience = 12.0\n", "").replace('"carried"\nhold', '"tripod"\nhold')
     path.write_text(text.replace('"carried"', '"sim"'))
     command = ["record", "--scene", "mug", "--views", "1", "--frames", "2", "--station", str(path)]
     assert main([*command, "--out", str(out)]) == 0

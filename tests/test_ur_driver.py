@@ -112,7 +112,8 @@ def test_slow_controller_is_waited_for(emulator, tmp_path):
     """A speed slider at 30 % and late answers are no faults."""
     emulator.order("slow", speed=0.3, delay=0.05)
     with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
-        state = station.arm.move_to(station.arm.state().joints + 0.1)
+        at_home(station.arm)
+        state = station.arm.move_to(HOME + 0.1)
         assert np.isfinite(state.joints).all()
 
 
@@ -121,7 +122,8 @@ def test_older_controllers_do(emulator, tmp_path):
     """A controller without the outputs that came later is asked in other ways, and moves."""
     emulator.order("lack", names=["tcp_offset", "payload", "speed_scaling"])
     with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
-        goal = station.arm.state().joints + 0.05
+        at_home(station.arm)
+        goal = HOME + 0.05
         np.testing.assert_allclose(station.arm.move_to(goal).joints, goal, atol=4e-4)
 
 
@@ -145,6 +147,8 @@ def test_keeps_the_contract(emulator, tmp_path):
 
 def test_a_controller_that_denies_every_pose_is_no_check(emulator, tmp_path, capfd):
     """It is refused by name; a setting does without it, and says so in every run; limits that change later refuse the goal."""
+    with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
+        at_home(station.arm)
     emulator.order("deny")
     with pytest.raises(faults.NotReady, match="safety limits do not allow") as caught:
         open_station(station_file(tmp_path, emulator), allow_motion=True).__enter__()
