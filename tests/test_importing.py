@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 
 import h5py
 import numpy as np
@@ -182,6 +183,11 @@ def _write(form, folder, raw, depth):
             (folder / f"raw{i}.raw").write_bytes(raw[i].astype(">u2").tobytes())
             np.save(folder / f"depth{i}.npy", depth[i])
         return {"raw": {"shape": list(SHAPE)}}
+    elif form == "words-interleaved":
+        for i in range(len(raw)):
+            (folder / f"raw{i}.raw").write_bytes(np.moveaxis(raw[i], 0, -1).astype("<u2").tobytes())
+            np.save(folder / f"depth{i}.npy", depth[i])
+        return {"raw": {"shape": [*SHAPE, 8]}}
     elif form == "words-of-floats":
         for i in range(len(raw)):
             (folder / f"raw{i}.bin").write_bytes(raw[i].astype("<u2").tobytes())
@@ -212,7 +218,7 @@ def _write(form, folder, raw, depth):
 
 
 FORMS = (
-    "npy", "big-endian", "npz", "npz-scene", "mat", "mat73", "mat-scene", "mat-struct", "mat-cells", "mat73-cells", "pages", "organised", "hdf5", ".png", ".tif", "millimetres", "words-of-floats", "channels-first", "frequencies-and-phases", "frequencies-apart", "channels-apart", "told-apart", "turned", "folders", "words", "points",
+    "npy", "big-endian", "npz", "npz-scene", "mat", "mat73", "mat-scene", "mat-struct", "mat-cells", "mat73-cells", "pages", "organised", "hdf5", ".png", ".tif", "millimetres", "words-interleaved", "words-of-floats", "channels-first", "frequencies-and-phases", "frequencies-apart", "channels-apart", "told-apart", "turned", "folders", "words", "points",
 )  # fmt: skip
 
 
@@ -318,6 +324,9 @@ def wrong(folder):
         "pickled": (lambda: none(put(), np.save(folder / "raw_1.npy", np.array([{}]), allow_pickle=True)), "raw_1.npy", "np.save"),
         "a size too small": (lambda: none(put(), np.save(folder / "raw_1.npy", raw[1, :, :20])), "", ""),
         "words without a size": (lambda: none((folder / "raw.raw").write_bytes(b"\0\1" * 999)), "does not say its size", "--shape"),
+        "words after a header": (
+            lambda: (folder / "raw.raw").write_bytes(b"\0\1" * 9607) and {"raw": {"shape": [30, 40]}}, "multiple of 30 x 40", "header of 14 bytes"
+        ),
         "words of another size": (
             lambda: (folder / "raw.raw").write_bytes(b"\0\1" * 999) and {"raw": {"shape": [30, 40]}}, "multiple of 30 x 40", "rows"
         ),
@@ -538,6 +547,18 @@ def test_poses_of_every_tool_are_the_same(tmp_path):
         else:
             np.savez(path, **held) if isinstance(held, dict) else np.save(path, held)
         np.testing.assert_allclose(read_poses(path, Said())[1], T, atol=1e-9, err_msg=name)
+    (tmp_path / "sparse").mkdir()
+    back, turned = np.linalg.inv(T), np.roll(q * [-1, -1, -1, 1], 1, axis=1)
+    rows = [
+        struct.pack("<I7dI", i, *turned[i], *back[i, :3, 3], 1)
+        + f"a{i}.png".encode()
+        + b"\0"
+        + struct.pack("<Q2dq", 1, 0, 0, -1)
+        for i in (1, 0)
+    ]
+    (tmp_path / "sparse/images.bin").write_bytes(struct.pack("<Q", 2) + b"".join(rows))
+    (tmp_path / "sparse/cameras.bin").write_bytes(b"")
+    np.testing.assert_allclose(read_poses(tmp_path / "sparse", Said())[1], T, atol=1e-9)
     (tmp_path / "each").mkdir()
     for i in (0, 1):
         np.savetxt(tmp_path / f"each/{i}.txt", T[i])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+import struct
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,13 @@ def _rows(path: Path) -> tuple[Rows, str]:
             f"{path}: no such file of poses", hint="[poses] file is looked for in SOURCE, or beside it"
         )
     try:
+        model = next(
+            (path / n for n in ("images.txt", "images.bin") if path.is_dir() and (path / n).is_file()), path
+        )
+        if model.suffix.lower() == ".bin":
+            return _of_colmap([*_colmap_lines(model.read_bytes())]) or [], ""
+        if model != path:
+            return _rows(model)
         if path.is_dir():
             files = sorted((p for p in path.iterdir() if p.is_file()), key=lambda p: natural(p.name))
             return [[x for row in _rows(f)[0] for x in row] for f in files if f.name[0] != "."], ""
@@ -79,7 +87,7 @@ def _rows(path: Path) -> tuple[Rows, str]:
         text = decoded(path.read_bytes())
         if text.lstrip()[:1] in {"{", "["}:
             return _of_json(json.loads(text)), ""
-    except (OSError, ValueError, KeyError, TypeError) as err:
+    except (OSError, ValueError, KeyError, TypeError, struct.error) as err:
         raise DataError(f"{path}: cannot read the poses: {err}", hint=_FORMS) from err
     lines = [line.strip() for line in text.splitlines()]
     if (colmap := _of_colmap(lines)) is not None:
@@ -187,6 +195,17 @@ def _of_colmap(lines: Sequence[str]) -> Rows | None:
         w, x, y, z, *t = (float(v) for v in row[1:8])
         out.append(invert(_pose(np.array([*t, x, y, z, w]), 1.0, row[-1])).ravel().tolist())
     return out
+
+
+def _colmap_lines(data: bytes) -> Iterator[str]:
+    """List the lines of pictures that ``images.txt`` would have, from ``images.bin``."""
+    (count,), at = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        number, *pose, camera = struct.unpack_from("<I7dI", data, at)
+        end = data.index(b"\0", at + 64)
+        yield " ".join(map(str, (number, *pose, camera, data[at + 64 : end].decode())))
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        at = end + 9 + 24 * points
 
 
 def _is_number(word: str) -> bool:

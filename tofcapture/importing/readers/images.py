@@ -18,6 +18,7 @@ from tofcapture.importing.source import Piece
 
 IMAGES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".bmp")
 BINARY = (".raw", ".bin")
+_CHANNELS = 16  # at most, of an image whose words have the channels last
 _FLOATS = 0.99  # of the pixels, that have sizes of a measurement
 
 
@@ -120,7 +121,9 @@ def read_words(path: Path, shape: tuple[int, ...], dtype: str = "") -> NDArray[A
         size = len(data) / kind.itemsize
         raise FormatError(
             f"{path}: expected a multiple of {rows} x {columns} {8 * kind.itemsize}-bit words, got {size:g}",
-            hint=f"rows of metadata count: {size / columns:g} rows of {columns} in all",
+            hint=f"rows of metadata count: {size / columns:g} rows of {columns} in all"
+            if size % columns == 0 or size < rows * columns
+            else f"is there a header of {len(data) % (rows * columns * kind.itemsize)} bytes? np.save(name, np.fromfile(path, '<u2', offset=...))",
         )
     if not dtype and (
         floats := next((k for k in ("<f4", ">f4") if _are_floats(data, k, rows * columns)), "")
@@ -128,6 +131,9 @@ def read_words(path: Path, shape: tuple[int, ...], dtype: str = "") -> NDArray[A
         kind = np.dtype(floats)
     images = np.frombuffer(data, dtype=kind).reshape(-1, rows, columns)
     if not dtype and kind.kind == "u":
-        images = min((images, images.byteswap()), key=roughness)
+        last = len(shape) > 2 and columns <= _CHANNELS  # interleaved: the next word is no neighbour
+        images = min(
+            (images, images.byteswap()), key=lambda i: roughness(np.swapaxes(i, 1, 2) if last else i)
+        )
     out = images.astype(kind.newbyteorder("="))
     return out.reshape(shape) if len(shape) > 2 and out.size == np.prod(shape) else out
