@@ -229,7 +229,8 @@ def page(parts, charts, tmp_path_factory):
 
 def test_page_looks_as_it_did(page, charts):
     """Charts of rig and loss, every picture of the sensor and of ground truth, and its words and numbers."""
-    answers.hold("report-page", answers.of_page(page), off=0.02, least=1e-3)
+    torch_here = [(torch.__version__, "TORCH")]  # its build is said too: +cpu, +cu130
+    answers.hold("report-page", answers.of_page(page), off=0.02, least=1e-3, names=torch_here)
     pictures.hold("report", charts)
     pictures.hold("report-views", pictures.of_page(page))
 

@@ -182,7 +182,14 @@ class Link(limits.Link):
         busy = self._busy
         if busy is None or time.monotonic() < busy[1]:
             return None
+        if (
+            not self._receive.isConnected()
+        ):  # in mid-command: the library may wait for the answer all the same
+            return self._lost()
         return faults.ControllerSilent(f"{self._host}: {busy[0]} is not answered")
+
+    def _lost(self) -> faults.LinkLost:
+        return faults.LinkLost(f"{self._host}: the connection broke")
 
     def trouble(self) -> faults.ArmFault | None:
         """Find what is wrong now: link, age of the data, safety, script."""
@@ -191,7 +198,7 @@ class Link(limits.Link):
         if stamp != self._newest:
             self._newest, self._seen = stamp, now
         if not self._receive.isConnected():
-            return faults.LinkLost(f"{self._host}: the connection broke")
+            return self._lost()
         if now - self._seen > _STALE:
             return faults.StaleData(f"{self._host}: no newer data for {now - self._seen:.1f} s")
         return danger(self._receive.getSafetyStatusBits(), self._receive.getRobotMode()) or halted(
