@@ -18,7 +18,9 @@ from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.ops.phase import Decoder
 from tofcapture.testing import check_tof
 
-tofCam660 = pytest.importorskip("epc.tofCam660.tofCam660", reason="epc-tofcam-toolkit is not installed")
+tofCam660 = pytest.importorskip(
+    "epc.tofCam660.tofCam660", reason="epc-tofcam-toolkit is not installed: pip install --group device-tests"
+)
 CAMERA = {"width": 320, "height": 240, "fx": 266.0, "fy": 266.0, "cx": 159.5, "cy": 119.5}
 TABLE = {"address": "127.0.0.1", "serial": "7-4321", "mhz": [24.0, 6.0], "exposure": 400e-6, "camera": CAMERA}
 WALL = np.broadcast_to(np.linspace(0.5, 7.0, 320), (240, 320))

@@ -122,8 +122,8 @@ def test_a_stop_is_ahead_on_the_way(speed):
 @pytest.fixture(scope="module")
 def sim():
     """One simulator for the tests that leave it well."""
-    pytest.importorskip("franky", reason="franky-control is not installed: pip install 'tofcapture[franka]'")
-    pytest.importorskip("franky_sim", reason="franky-sim is not installed")
+    for library in ("franky", "franky_sim"):
+        pytest.importorskip(library, reason=f"{library} is not installed: pip install --group device-tests")
     with FrankaSim() as process:
         yield process
 

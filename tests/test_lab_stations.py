@@ -18,6 +18,7 @@ from tofcapture.files.view import find_views, open_view
 from tofcapture.rig import Rig, dumps_rig
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ImportWarning")]
+LACKING = "its client is not installed: pip install --group device-tests"
 FAKE = Camera(512, 512, 560.0, 560.0, 255.5, 250.0)
 
 
@@ -72,6 +73,7 @@ def test_arducam(tmp_path):
 
 def test_realsense(tmp_path):
     """A bag that the library recorded."""
+    pytest.importorskip("pyrealsense2", reason=LACKING)
     from tests import test_realsense_driver as make
 
     other, file = test_arducam_driver, tmp_path / "frames.raw"
@@ -96,6 +98,7 @@ def test_femto(tmp_path):
 
 def test_espros(tmp_path):
     """The vendor's client at its own ports."""
+    pytest.importorskip("epc.tofCam660", reason=LACKING)
     from tests.test_espros_driver import TABLE
 
     wall = 1.5 * np.linalg.norm(CAMERA.unproject(np.ones(CAMERA.shape)), axis=-1)

@@ -18,7 +18,9 @@ from tofcapture.devices.tof.arducam import ArducamTof
 from tofcapture.errors import ConfigError, DeviceError
 from tofcapture.testing import check_stereo
 
-rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed")
+rs = pytest.importorskip(
+    "pyrealsense2", reason="pyrealsense2 is not installed: pip install --group device-tests"
+)
 SOON = 15.0 + PATIENCE
 W, H, UNIT = 320, 240, 0.0001
 
