@@ -99,6 +99,11 @@ def test_the_backend_answers_for_its_weights_only(run, rig):  # noqa: F811
     predict(run / "raw.npy", run / "b", **asked)
     np.testing.assert_array_equal(np.load(run / "a/depth.npy"), np.load(run / "b/depth.npy"))
     made = onnx.load(str(run / "model.onnx"))
+    (trust,) = (o for o in made.graph.output if o.name == "trust")
+    made.graph.output.remove(trust)
+    onnx.save(made, str(run / "model.onnx"))
+    with pytest.raises(ConfigError, match="an export that answers trust, got an older one"):
+        predict(run / "raw.npy", run / "c", **asked)
     del made.metadata_props[:]
     onnx.save(made, str(run / "model.onnx"))
     with pytest.raises(ConfigError, match="says of which weights") as caught:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,7 +38,6 @@ from tofcapture_model.geometry.maps import (
     with_lens,
 )
 from tofcapture_model.geometry.multipath import cues, patches
-from tofcapture_model.inference import export as exporting
 from tofcapture_model.inference import predict as predicting
 from tofcapture_model.inference.predict import Predictor, predict
 from tofcapture_model.training.train import train
@@ -331,35 +329,3 @@ def test_an_export_takes_any_lens(tmp_path, monkeypatch):
     model = onnx.load(str(exported))
     place = next(i for i in model.graph.input if i.name == "intrinsics")
     assert place.type.tensor_type.shape.dim[1].dim_value == 12
-
-
-def test_an_export_made_before_lenses_were_known_says_what_to_do(tmp_path, monkeypatch):
-    """It takes four numbers; a pinhole it answers as before."""
-    pytest.importorskip("onnxruntime")
-
-    class Old:
-        def get_inputs(self):
-            return [
-                SimpleNamespace(name=n, shape=["batch", k, *SMALL.shape])
-                for n, k in (("raw", 8), ("intrinsics", 4))
-            ]
-
-        def run(self, names, feed):
-            assert feed["intrinsics"].shape == (1, 4)
-            shape = (1, 1, *SMALL.scaled(2).shape)
-            return [
-                np.ones(shape, np.float32),
-                np.ones((1, 3, *shape[2:]), np.float32),
-                np.ones(shape, np.float32),
-            ]
-
-    weights = save_network(tmp_path, preset("demo"))
-    weights.with_suffix(".onnx").write_bytes(b"")
-    monkeypatch.setattr(exporting, "open_onnx", lambda _: Old())
-    monkeypatch.setattr(exporting, "config_of", lambda *_: preset("demo"))
-    ask = Predictor(weights, backend="onnx")
-    assert ask(wall(SMALL), TofInfo("t", "", SMALL, np.zeros(3))).depth.shape == (72, 96)
-    lens = replace(SMALL, distortion=(-0.1, 0.02, 0.001, 0.002, 0.0))
-    with pytest.raises(ConfigError, match="takes 0 of") as caught:
-        ask(wall(lens), TofInfo("t", "", lens, np.zeros(3)))
-    assert "export" in caught.value.hint

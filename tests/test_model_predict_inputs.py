@@ -138,8 +138,12 @@ def test_it_says_what_was_measured_and_what_was_filled(weights, rig, tmp_path, c
     assert measured[:, 24:].all()
     assert answer["files"]["measured.npy"] == str(tmp_path / "out/measured.npy")
     assert "measured.npy" in (tmp_path / "out/units.txt").read_text()
+    assert np.load(tmp_path / "out/trust.npy").shape == (36, 48)
+    assert answer["trusted"] == 1.0  # weights that have seen nothing know of no stranger
     assert main(words) == 0
-    assert "93.8% of the pixels were measured" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "93.8% of the pixels were measured" in said
+    assert "unlike what the network learned from" not in said
 
 
 def test_counts_beyond_saturation_are_refused_until_it_is_said(weights, rig, tmp_path):

@@ -18,6 +18,7 @@ from tofcapture_model.config import Config, load_config, preset, presets
 from tofcapture_model.evaluation.tables import SUITES
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # malloc.h
+_SURE = 0.99  # of a frame; a few strange pixels are no news
 _WEIGHTS = "checkpoint, folder of a run, or 'bundled' (default: the bundled weights)"
 
 
@@ -330,6 +331,10 @@ def _told(result: dict[str, Any], out: Path, device: str) -> str:
     if result["filled"]:
         share = f"{result['measured']:.1%} of the pixels were measured"
         lines.append(f"{share}, the others filled (measured.npy says which)")
+    if (trusted := result["trusted"]) is not None and trusted < _SURE:
+        lines.append(
+            f"{1 - trusted:.1%} is unlike what the network learned from: the sensor's depth stands there (trust.npy)"
+        )
     if result["assumed"]:
         lines.append(f"assumed: {result['assumed']}; --rig brings those of your camera")
     return "\n".join(lines)

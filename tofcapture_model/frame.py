@@ -59,6 +59,9 @@ class Estimate(NamedTuple):
     error: Tensor
     initial_depth: Tensor
     initial_normals: Tensor
+    #: (B, 1, H, W) of the sensor's pixels: 1 where all that was read is like what was learned from, 0 where the sensor's depth stands
+    #: instead; None: the network does not know
+    trust: Tensor | None = None
 
 
 def expect_channels(raw: Tensor, channels: int, network: str) -> None:

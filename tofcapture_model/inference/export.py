@@ -16,10 +16,10 @@ from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.seal import sha256_of
 from tofcapture_model.config import Config, dumps_config, loads_config
 from tofcapture_model.frame import Estimate, Frame
-from tofcapture_model.geometry.maps import LENS, PINHOLE, with_lens
+from tofcapture_model.geometry.maps import with_lens
 from tofcapture_model.networks.checkpoint import find_model, load_checkpoint
 
-OUTPUTS = ("depth_2x", "normals_2x", "error_2x")
+OUTPUTS = ("depth_2x", "normals_2x", "error_2x", "trust")
 DIGEST, CONFIG = "weights_sha256", "config.toml"
 """What an export carries beside the network: SHA-256 of the checkpoint's file, and its configuration. Metadata of ``.onnx``, extra files
 of ``.pt2``."""
@@ -31,16 +31,18 @@ _CROSSING = 1e-3  # share of pixels that may differ by more
 
 
 class Flat(nn.Module):
-    """A model whose inputs are the fields of a frame in their order, and whose outputs are depth, normals and error."""
+    """A model whose inputs are the fields of a frame in their order, and whose outputs are depth, normals, error and trust."""
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__()
         self.model = model
 
-    def forward(self, *fields: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, *fields: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """See :class:`tofcapture_model.frame.Frame` and :class:`tofcapture_model.frame.Estimate`."""
-        found: Estimate = self.model(Frame(*fields))
-        return found.depth, found.normals, found.error
+        frame = Frame(*fields)
+        found: Estimate = self.model(frame)
+        trust = torch.ones_like(frame.depth) if found.trust is None else found.trust
+        return found.depth, found.normals, found.error, trust
 
 
 def example(batch: int, size: tuple[int, int] = SIZE, seed: int = 0) -> Frame:
@@ -222,6 +224,11 @@ def config_of(session: Any, path: Path, weights: Path) -> Config:
         raise ConfigError(
             f"{path}: expected an export that says of which weights it is, got none", hint=again
         )
+    if lacks := set(OUTPUTS) - {o.name for o in session.get_outputs()}:
+        raise ConfigError(
+            f"{path}: expected an export that answers {', '.join(sorted(lacks))}, got an older one",
+            hint=again,
+        )
     if weights.exists() and (found := sha256_of(weights)) != told[DIGEST]:
         raise ConfigError(
             f"{path}: expected an export of {weights} (sha256 {found[:12]}...), got one of other weights ({told[DIGEST][:12]}...)",
@@ -231,22 +238,10 @@ def config_of(session: Any, path: Path, weights: Path) -> Config:
 
 
 def ask_onnx(session: Any, frame: Frame) -> list[NDArray[np.float32]]:
-    """Run an opened model on a frame; inputs that the export found unused are not asked for.
-
-    Raises
-    ------
-    ConfigError
-        The camera has a lens, and the export was made before they took such ones.
-    """
-    wanted = {i.name: i.shape for i in session.get_inputs()}
-    numbers = wanted.get("intrinsics", (0, LENS))[1]
-    if frame.intrinsics[:, numbers:].any():
-        raise ConfigError(
-            f"expected an export for cameras with such a lens, got one that takes {numbers - PINHOLE} of its coefficients",
-            hint="run tofcapture export again: it takes any lens now",
-        )
+    """Run an opened model on a frame; inputs that the export found unused are not asked for."""
+    wanted = {i.name for i in session.get_inputs()}
     ends = frame.modulation[:, :2]  # the lowest and the highest: no network reads others
-    asked = frame._replace(intrinsics=with_lens(frame.intrinsics)[:, :numbers], modulation=ends)
+    asked = frame._replace(intrinsics=with_lens(frame.intrinsics), modulation=ends)
     feed = {k: np.ascontiguousarray(v.numpy()) for k, v in asked._asdict().items() if k in wanted}
     found: list[NDArray[np.float32]] = session.run(list(OUTPUTS), feed)
     return found

@@ -31,6 +31,7 @@ from tofcapture_model.data.conditions import Seen, outside
 from tofcapture_model.data.raw_input import IMPORTED, RawInput, from_arrays, read_input, taken
 from tofcapture_model.frame import MAX_RANGE, MIN_RANGE, Frame
 from tofcapture_model.geometry.decoder import Taps, TorchDecoder
+from tofcapture_model.inference.export import Flat, ask_onnx, config_of, open_onnx
 from tofcapture_model.inference.prediction import Prediction, write_prediction
 from tofcapture_model.networks.checkpoint import find_model, load_checkpoint
 from tofcapture_model.networks.joint import JointModel
@@ -48,7 +49,7 @@ class _Watch(Protocol):
 
 
 class _Prepared(NamedTuple):
-    """Hold what is ready for a camera: from taps and temperature to inputs on the device, from these to depth, normals, error, validity."""
+    """Hold what is ready for a camera: from taps and temperature to inputs on the device, from these to an answer of :data:`Ask` and more."""
 
     prepare: Callable[[NDArray[Any], float], Any]
     ask: Callable[[Any], tuple[Tensor, ...]]
@@ -126,14 +127,16 @@ class Predictor:
         with torch.inference_mode():
             prepared = self._prepare(info, camera)
             inputs, decode_ms = watch(lambda: prepared.prepare(raw, celsius), wait)
-            (depth, normals, error, *mine), inference_ms = watch(lambda: prepared.ask(inputs), wait)
+            (depth, normals, error, trust, *mine), inference_ms = watch(lambda: prepared.ask(inputs), wait)
         valid, sensor, confidence = (_image(x)[0] for x in mine)
         measured = valid > 0
         if not measured.any():
             raise _nothing(raw, info, where)
+        knows = self.network not in BASELINES
         return Prediction(
             depth=_image(depth)[0],
-            error=None if self.network in BASELINES else _image(error)[0],
+            error=_image(error)[0] if knows else None,
+            trust=_image(trust)[0] if knows else None,
             normals=np.ascontiguousarray(_image(normals).transpose(1, 2, 0)),
             measured=measured.repeat(2, axis=0).repeat(2, axis=1),
             camera=camera.scaled(2),
@@ -237,7 +240,7 @@ def _timed(work: Callable[[], T], wait: Callable[[], None]) -> tuple[T, float]:
     return answer, statistics.median(times[WARM:])
 
 
-Ask = Callable[[Frame], tuple[Tensor, Tensor, Tensor]]
+Ask = Callable[[Frame], tuple[Tensor, Tensor, Tensor, Tensor]]
 Inputs = TypeVar("Inputs", Frame, Taps)
 
 
@@ -290,11 +293,13 @@ def torch_model(weights: str | Path | None, device: str) -> tuple[Ask, str, Seen
     if half and isinstance(model, JointModel):  # baselines have layers that stay in float32
         _halve_convolutions(model)
 
-    def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+    flat = Flat(model)
+
+    def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         # weights that are cast and kept would be lost to a graph that was recorded with them
         with torch.autocast(kind, torch.bfloat16, enabled=half, cache_enabled=kind != "cuda"):
-            found = model(frame)
-        return found.depth, found.normals, found.error
+            found: tuple[Tensor, Tensor, Tensor, Tensor] = flat(*frame)
+        return found
 
     return ask, config.network.kind, provenance.get("seen")
 
@@ -317,8 +322,6 @@ def has_bfloat16(kind: str) -> bool:
 
 
 def _onnx_model(weights: str | Path | None) -> tuple[Ask, str, Seen | None]:
-    from tofcapture_model.inference.export import ask_onnx, config_of, open_onnx
-
     named = find_model(weights)  # a checkpoint, or the export itself
     path = named.with_suffix(".onnx")
     if not path.exists():
@@ -329,14 +332,14 @@ def _onnx_model(weights: str | Path | None) -> tuple[Ask, str, Seen | None]:
     config = config_of(session, path, named if named != path else path.with_suffix(".safetensors"))
     size = tuple(session.get_inputs()[0].shape[-2:])
 
-    def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+    def ask(frame: Frame) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         got = tuple(frame.depth.shape[-2:])
         if size != got:
             raise ConfigError(
                 f"{path}: exported for frames of {size}, got {got}", hint="tofcapture export --size"
             )
-        depth, normals, error = (torch.from_numpy(x) for x in ask_onnx(session, frame))
-        return depth, normals, error
+        depth, normals, error, trust = (torch.from_numpy(x) for x in ask_onnx(session, frame))
+        return depth, normals, error, trust
 
     return ask, config.network.kind, None
 
@@ -495,6 +498,7 @@ def _row(data: RawInput, prediction: Prediction, written: dict[str, str]) -> dic
         "shape": list(prediction.depth.shape),
         "median_depth": float(np.median(prediction.depth)),
         "median_sensor_depth": float(np.nanmedian(prediction.sensor)),
+        "trusted": None if prediction.trust is None else round(float(prediction.trust.mean()), 4),
         "median_expected_error": None if error is None else float(np.median(error)),
         "files": written,
     }

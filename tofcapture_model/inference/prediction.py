@@ -39,6 +39,9 @@ class Prediction:
         Kind of network that answered.
     sensor
         (H, W) float32 metres: the sensor's own depth of the same frame; NaN: none.
+    trust
+        (H, W) float32: 1 where all that the network read is like what it learned from, 0 where the sensor's depth, smoothed, stands
+        instead; ``None`` from a network that does not know.
     outside
         What of the camera or the light the network has not seen in training, in words; empty: nothing, as far as it is known.
     inference_ms
@@ -55,6 +58,7 @@ class Prediction:
     camera: Camera
     network: str
     sensor: Float32
+    trust: Float32 | None = None
     outside: str = ""
     inference_ms: float = math.nan
     decode_ms: float = math.nan
@@ -94,7 +98,8 @@ def write_prediction(prediction: Prediction, out: Path) -> dict[str, str]:
     ``depth.npy``, ``error.npy`` (float32 metres), ``normals.npy``, ``measured.npy`` (bool), ``cloud.ply``, ``depth.png`` (16 bit,
     unit 0.1 mm, so up to 6.5535 m), ``normals.png`` (8 bit, ``(n + 1) / 2`` with y and z towards the viewer), ``sensor.npy`` (the
     sensor's own depth, float32 metres, NaN: none), ``picture.png`` (the sensor's depth, the network's in the same colours, normals),
-    ``units.txt``. From a network that predicts no error there is no ``error.npy``; one of an earlier prediction is removed.
+    ``trust.npy``, ``units.txt``. From a network that predicts no error there is no ``error.npy`` and no ``trust.npy``; those of an
+    earlier prediction are removed.
 
     Returns
     -------
@@ -111,10 +116,11 @@ def write_prediction(prediction: Prediction, out: Path) -> dict[str, str]:
 
 def _write(prediction: Prediction, out: Path) -> dict[str, str]:
     out.mkdir(parents=True, exist_ok=True)
-    (out / "error.npy").unlink(missing_ok=True)
+    for name in ("error.npy", "trust.npy"):
+        (out / name).unlink(missing_ok=True)
     arrays = {
         f"{name}.npy": array
-        for name in ("depth", "normals", "error", "measured", "sensor")
+        for name in ("depth", "normals", "error", "measured", "sensor", "trust")
         if (array := getattr(prediction, name)) is not None
     }
     tenth_mm = np.clip(np.rint(prediction.depth * 1e4), 0, 65535).astype(np.uint16)
@@ -134,6 +140,7 @@ def _write(prediction: Prediction, out: Path) -> dict[str, str]:
         "npy, ply: metres, ToF frame (x right, y down, z forward)\n"
         "measured.npy: bool, true where the depth stands on a measurement, false where the sensor had none and it was filled\n"
         "sensor.npy: metres, the sensor's own depth of the frame at its own resolution, NaN where it had none\n"
+        "trust.npy: 1 where the frame is like what the network learned from, 0 where the sensor's depth, smoothed, stands instead\n"
         "depth.png: 0.1 mm per count\n"
         f"picture.png: the sensor's depth, the network's depth, both {scale} from violet to yellow, and its normals\n",
     )

@@ -48,10 +48,10 @@ class JointModel(nn.Module):
         else:
             normals = self.raw2normal(shared, features, depth, frame)
         if stage in ("depth", "normal"):
-            return Estimate(depth, normals, error, depth, normals)
+            return Estimate(depth, normals, error, depth, normals, features.trust)
         fine = scale_intrinsics(frame.intrinsics, 2)
         fine_depth, fine_normals = self.refinement(depth, normals, error, fine)
-        return Estimate(fine_depth, fine_normals, error, depth, normals)
+        return Estimate(fine_depth, fine_normals, error, depth, normals, features.trust)
 
 
 class PaperModel(JointModel):

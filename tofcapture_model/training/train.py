@@ -182,7 +182,7 @@ class Learner:
         reduced = self.training.precision == "bfloat16"
         with torch.autocast(self.group.device.type, torch.bfloat16, enabled=reduced):
             estimate = self._network(frame, self.stage.name)
-        return Estimate(*(x.float() for x in estimate))
+        return Estimate(*(x.float() for x in estimate[:-1]))  # no loss asks for trust
 
     def backward(self, loss: Objective) -> float:
         """Compute the gradient of a loss and clip it; returns the norm that it had."""
