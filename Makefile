@@ -10,7 +10,10 @@ STAMP := $(VENV)/.installed
 # make demo TORCH="torch==2.13.0 --index-url ..." with the address that PyTorch's install page gives.
 TORCH ?= $(shell command -v nvidia-smi >/dev/null 2>&1 && echo "torch" || echo "torch==2.13.0")
 
-.PHONY: demo test lint docs gpu clean
+# The Pythons of `make pythons`.
+PYTHONS ?= python3.11 python3.12 python3.13
+
+.PHONY: demo test lint docs gpu pythons clean
 .DELETE_ON_ERROR:
 
 # What pip cannot find is said in the first line, its own words after it.
@@ -51,6 +54,13 @@ gpu: $(STAMP)
 	$(VENV)/bin/python -m pytest -m gpu
 	$(VENV)/bin/python benchmarks/chamfer.py --device cuda
 	$(VENV)/bin/python benchmarks/predict.py --device cuda
+
+# Demo and tests of the last commit on each of them, from a fresh clone in build/.
+pythons:
+	for python in $(PYTHONS); do \
+		clone=build/$$(basename $$python); rm -rf $$clone; git clone -q . $$clone || exit 1; \
+		$(MAKE) -C $$clone PYTHON=$$python demo test || exit 1; \
+	done
 
 clean:
 	rm -rf $(VENV)

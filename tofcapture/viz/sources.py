@@ -34,7 +34,7 @@ def recording_source(recording: Path) -> Source:
     paths = [path for views in scenes_of(recording).values() for path in views]
     rig, arm = rig_of(recording, paths[0]), arm_of(recording)
     names = [f"{p.parent.name} {number_of(p)}" for p in paths]
-    title = f"recording {recording.resolve().name}"
+    title = _titled("recording", recording)
     return Source(title, names, lambda i: view_shot(open_view(paths[i]), rig, arm), rig)
 
 
@@ -161,7 +161,13 @@ def dataset_source(dataset: Path) -> Source:
     Raises :class:`DataError`: the manifest, or a shard, is missing or damaged.
     """
     entries = load_manifest(dataset).scenes
-    return _shards(f"dataset {dataset.name}", [dataset / entries[name].path for name in sorted(entries)])
+    return _shards(_titled("dataset", dataset), [dataset / entries[name].path for name in sorted(entries)])
+
+
+def _titled(kind: str, folder: Path) -> str:
+    """Name a folder and what it is, once where the name says it."""
+    name = folder.resolve().name
+    return name if kind in name else f"{kind} {name}"
 
 
 def _shards(title: str, paths: list[Path]) -> Source:
