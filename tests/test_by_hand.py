@@ -361,6 +361,12 @@ def test_faults_of_a_stream_have_names():
         pytest.raises(DeviceError, match="no pose"),
     ):
         rig.await_view(0)
+    with (
+        _Tracker(lambda t: (np.nan, 0, 0)) as blind,
+        _tracked(blind) as rig,
+        pytest.raises(DeviceError, match="expected 'time x y z qx qy qz qw'"),
+    ):
+        rig.await_view(0)
     stream = PoseStream("127.0.0.1:0".replace(":0", f":{silent.port}"))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", silent.port))
