@@ -71,6 +71,9 @@ def frame_of(info, seed=0):
     raw = np.clip(np.rint(raw), 0, 4095)
     raw[:, rng.random(depth.shape) < 0.05] = 4095
     raw[0, rng.random(depth.shape) < 0.03] = 4095
+    if len(raw) > 4:
+        raw[2, rng.random(depth.shape) < 0.03] = 90  # stuck
+    raw[1, :, 7] = 1500
     if (
         len(raw) == 8
     ):  # no modulated light at all; with thirds as weights it would be whatever rounding leaves
@@ -95,6 +98,15 @@ def test_it_decodes_as_the_processor_does(name, celsius):
         torch.testing.assert_close(getattr(found, field), getattr(expected, field), atol=2e-7, rtol=1e-5)
     for field in ("modulation", "intrinsics", "demodulation"):
         assert torch.equal(getattr(found, field), getattr(expected, field))
+
+
+def test_a_stuck_tap_measures_nothing():
+    """Where four taps fit no cosine there is no depth, in single pixels and in a column that always says the same."""
+    info, raw = INFOS["ideal"], frame_of(INFOS["ideal"], 1)
+    stuck = raw[2] == 90
+    frame = make_frame(raw, info, info.camera)
+    assert frame.valid[0][stuck].mean() < 0.05
+    assert not frame.valid[0, :, 7].any()
 
 
 def test_a_mean_and_integers_are_taken_alike():

@@ -21,7 +21,7 @@ from tofcapture.errors import ConfigError, DataError
 from tofcapture.files.cache import PackedScene, open_cache
 from tofcapture.files.layout import MaskBit
 from tofcapture.files.shard import ShardReader
-from tofcapture.frames import TofInfo
+from tofcapture.frames import TofFlag, TofInfo
 from tofcapture.ops.phase import Decoder, TapNoise, photon_transfer
 from tofcapture_model.data.augment import BurstNoise
 from tofcapture_model.data.raw_input import taken
@@ -85,6 +85,7 @@ def make_frame(
     maps, signals = (decoder or frame_decoder(info, camera)).signals(raw, celsius)
     depth, ends = maps.depth, signals.phasor[[0, -1]]
     valid = np.isfinite(depth) & (depth > MIN_RANGE) & (depth < MAX_RANGE)
+    valid &= (maps.flags & TofFlag.INCONSISTENT) == 0
     frame = Frame(
         raw=_tensor(raw) / info.saturation,
         phasor=_tensor(ends.reshape(4, *depth.shape)) / info.saturation,

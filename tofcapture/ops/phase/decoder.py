@@ -29,15 +29,15 @@ UNCERTAIN = 0.020  # m, standard deviation from which a pixel is of low confiden
 _STEEP = float(np.tan(np.radians(80)))
 _BROKEN = 0.25  # of a row's or column's pixels, more than noise has, are odd: all of it is inconsistent
 _ODD = 0.1  # of the pixels, as far as noise goes
-_GROSS = np.float32(0.25**2)  # of the power: more is off in no sound tap, whatever the noise of the frame
+GROSS = np.float32(0.25**2)  # of the power: more is off in no sound tap, whatever the noise of the frame
 
 
-def _rare(count: int) -> float:
+def rare(count: int) -> float:
     """Chi squared of so many degrees of freedom that noise exceeds in one of 30,000 pixels."""
     return 17 + 2.8 * count
 
 
-def _odd(count: int) -> float:
+def odd_beyond(count: int) -> float:
     """Chi squared of so many degrees of freedom that noise exceeds in :data:`_ODD` of the pixels, or a little fewer."""
     return 0.6 + 2.1 * count
 
@@ -203,33 +203,34 @@ class Decoder:
         flags |= self._doubt.view(np.uint8) * np.uint8(TofFlag.AMBIGUOUS)
         float32.dim(self._power, self._variance, self._uncertain, int(TofFlag.LOW_CONFIDENCE), flags)
         shape = self.info.camera.shape
-        odd = [np.zeros(n, np.int32) for n in shape]
+        odd, some = [np.zeros(n, np.int32) for n in shape], self._meter.some
         for power, (first, count) in zip(self._power, self._spare, strict=True):
             if count:
                 spare = self._taps[first : first + count]
                 float32.inconsistent(
-                    spare, power, self._variance, saturated, np.float32(_rare(count)), np.float32(_odd(count)),
-                    np.float32(self._noisier(spare, power, saturated)), _GROSS, int(TofFlag.INCONSISTENT), flags, *odd,
+                    spare, power, self._variance, saturated, np.float32(rare(count)), np.float32(odd_beyond(count)),
+                    np.float32(noisier(*(x[..., some] for x in (spare, power, self._variance, saturated)))), GROSS, int(TofFlag.INCONSISTENT), flags, *odd,
                 )  # fmt: skip
-                rows, columns = (_broken(*each) for each in zip(odd, shape[::-1], strict=True))
+                rows, columns = (line > most_odd(n) for line, n in zip(odd, shape[::-1], strict=True))
                 stuck = stuck | rows[:, None] | columns if rows.any() or columns.any() else stuck
         if stuck.any():
             flags |= np.uint8(TofFlag.INCONSISTENT) * (stuck.ravel() & ~saturated)
         return flags
 
-    def _noisier(self, spare: Float32, power: Float32, saturated: NDArray[np.bool_]) -> float:
-        """Tell how many times the variance that the noise model says this frame has, by the median of what no cosine explains."""
-        some, count = self._meter.some, len(spare)
-        lit = ~saturated[some] & (power[some] > 0)
-        ratio = (np.square(spare[:, some]).sum(axis=0) / self._variance[some])[lit]
-        return max(1.0, middle(ratio) / (count * median_of_chi_squared(count)))
+
+def noisier(spare: Float32, power: Float32, variance: Float32, saturated: NDArray[np.bool_]) -> float:
+    """Tell how many times the variance that the noise model says a frame has, by the median of what no cosine explains.
+
+    ``spare`` (R, N) are combinations of taps that are noise alone, of pixels (N,).
+    """
+    lit = ~saturated & (power > 0)
+    ratio = (np.square(spare).sum(axis=0) / variance)[lit]
+    return max(1.0, middle(ratio) / (len(spare) * median_of_chi_squared(len(spare))))
 
 
-def _broken(odd: NDArray[np.int32], pixels: int) -> NDArray[np.bool_]:
-    """Find lines of so many pixels in which more are odd than noise makes: some of a stuck tap's values are right by chance."""
-    most = (_ODD + _BROKEN) * pixels + 3.5 * np.sqrt(_ODD * (1 - _ODD) * max(pixels, 4))
-    out: NDArray[np.bool_] = odd > most
-    return out
+def most_odd(pixels: int) -> float:
+    """Tell how many of a line's pixels are odd by noise: beyond it all is inconsistent. Some values of a stuck tap are right by chance."""
+    return float((_ODD + _BROKEN) * pixels + 3.5 * np.sqrt(_ODD * (1 - _ODD) * max(pixels, 4)))
 
 
 def flying_pixels(
