@@ -207,9 +207,10 @@ class Decoder:
         for power, (first, count) in zip(self._power, self._spare, strict=True):
             if count:
                 spare = self._taps[first : first + count]
+                times = noisier(spare[:, some], power[some], self._variance[some], saturated[some])
                 float32.inconsistent(
                     spare, power, self._variance, saturated, np.float32(rare(count)), np.float32(odd_beyond(count)),
-                    np.float32(noisier(*(x[..., some] for x in (spare, power, self._variance, saturated)))), GROSS, int(TofFlag.INCONSISTENT), flags, *odd,
+                    np.float32(times), GROSS, int(TofFlag.INCONSISTENT), flags, *odd,
                 )  # fmt: skip
                 rows, columns = (line > most_odd(n) for line, n in zip(odd, shape[::-1], strict=True))
                 stuck = stuck | rows[:, None] | columns if rows.any() or columns.any() else stuck
