@@ -73,8 +73,8 @@ def align(
     method_named(method)
     recording = Path(recording)
     out = recording if out is None else Path(out)
-    calibration_views(recording)  # what is no recording is said first
-    check_writable(out, "name a folder that can be written: --out")
+    if recording.is_dir():  # else the answer is that there is no recording
+        check_writable(out, "name a folder that can be written: --out")
     pairs, views = _load(recording, progress, joint=method == "joint")
     start = initial if isinstance(initial, Rig) else pairs[0].rig
     if initial == "none":
