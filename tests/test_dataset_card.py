@@ -61,8 +61,9 @@ def test_the_numbers_of_the_card_are_those_of_the_data(tmp_path):
     assert f"({SW} x {SH})" in text
     assert f"{channels} at {hz[0] / 1e6:g} and {hz[1] / 1e6:g} MHz" in text
     assert f"{sizes / 1e6:.2f} MB in all; 3 objects by name" in text
-    assert "median 0.13 mm, 99th percentile 1.50 mm" in text
-    assert "which covers 88% of the object's pixels" in text
+    assert "median 0.13 mm, 99 % within 1.50 mm, good on 88% of the object's pixels" in text
+    bare = {"median_error_mm": 0.126, "p99_error_mm": None, "coverage": None}
+    assert "more than 1 % where there is no surface, no object is in it" in card_text(folder, manifest, bare)
     assert (f"{good / (4 * H * W * views):.0%}" if views else "An unknown share") in text
     assert "Its error is not known" in card_text(folder, manifest, None)
 

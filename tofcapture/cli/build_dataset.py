@@ -118,6 +118,8 @@ def _outcome(result: BuildResult, seconds: float, *, complete: bool) -> Outcome:
 
 
 def _text(result: BuildResult, views: int, seconds: float) -> str:
+    from tofcapture.dataset.sample import error_in_words
+
     lines = [
         f"{name:<24} {entry.split:<6} {counted(entry.views, 'view')}"
         for name, entry in sorted(result.scenes.items())
@@ -129,11 +131,7 @@ def _text(result: BuildResult, views: int, seconds: float) -> str:
     if result.skipped:
         lines.append(f"{counted(len(result.skipped), 'scene')} already built")
     if result.gt is not None:
-        gt = result.gt
-        lines.append(
-            f"ground truth against the simulator: median {gt.median_error_mm:.2f} mm, "
-            f"99 % {gt.p99_error_mm:.2f} mm, covers {gt.coverage:.0%} of the object"
-        )
+        lines.append(f"ground truth against the simulator: {error_in_words(result.gt.table())}")
     lines += [
         f"no good ground truth in {scene}: {', '.join(names)}; they stay in the shard, fully masked"
         for scene, names in result.bare.items()

@@ -137,6 +137,8 @@ def _data(result: Simulated) -> dict[str, Any]:
 
 
 def _text(data: dict[str, Any]) -> str:
+    from tofcapture.dataset.sample import error_in_words
+
     lines = [
         f"{data['dataset']}: {counted(data['scenes'], 'scene')}, {counted(data['views'], 'view')}, {data['bytes'] / 1e9:.2f} GB in {data['seconds']:.0f} s"
     ]
@@ -151,12 +153,8 @@ def _text(data: dict[str, Any]) -> str:
         lines.append(
             f"{full['scenes']} scenes like these: {full['hours']:.1f} hours here and now, {full['core_hours']:.1f} hours of one core, {full['gigabytes']:.1f} GB"
         )
-    if data["gt"] is not None and data["gt"]["median_error_mm"] is not None:
-        gt = data["gt"]
-        lines.append(
-            f"ground truth against the simulator: median {gt['median_error_mm']:.2f} mm, "
-            f"99 % {gt['p99_error_mm']:.2f} mm, covers {gt['coverage']:.0%} of the objects"
-        )
+    if data["gt"] is not None:
+        lines.append(f"ground truth against the simulator: {error_in_words(data['gt'])}")
     return "\n".join(lines)
 
 

@@ -8,6 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from tofcapture.dataset.sample import error_in_words
 from tofcapture.files.layout import SHARD, SPLITS
 from tofcapture.files.manifest import Manifest, manifest_path, object_of
 from tofcapture.files.seal import sha256_of, write_text
@@ -105,10 +106,7 @@ def card_text(dataset: Path, manifest: Manifest, gt: Mapping[str, Any] | None) -
 def _error_line(gt: Mapping[str, Any] | None) -> str:
     if gt is None or gt["median_error_mm"] is None:
         return "Its error is not known from within: there is no truth to compare with."
-    return (
-        f"Against the simulator's truth: median {gt['median_error_mm']:.2f} mm, 99th percentile {gt['p99_error_mm']:.2f} mm "
-        f"where the mask is 0, which covers {gt['coverage']:.0%} of the object's pixels."
-    )
+    return f"Against the simulator's truth, where the mask is 0: {error_in_words(gt)}."
 
 
 def _split_rows(manifest: Manifest) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -228,6 +228,16 @@ class TruthError:
     def table(self) -> dict[str, Any]:
         """Return JSON types: numbers that are not finite become null."""
         return {k: v if np.isfinite(v) else None for k, v in asdict(self).items()}
+
+
+def error_in_words(gt: Mapping[str, Any]) -> str:
+    """Say what :meth:`TruthError.table` holds, as far as there is anything."""
+    median, p99, share = gt["median_error_mm"], gt["p99_error_mm"], gt["coverage"]
+    if median is None:
+        return "no pixel to compare"
+    most = "more than 1 % where there is no surface" if p99 is None else f"99 % within {p99:.2f} mm"
+    covers = "no object is in it" if share is None else f"good on {share:.0%} of the object's pixels"
+    return f"median {median:.2f} mm, {most}, {covers}"
 
 
 @dataclass(frozen=True)
