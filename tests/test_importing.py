@@ -388,7 +388,7 @@ def wrong(folder):
         "poses that are not there": (lambda: put(poses={"file": "gt.txt"}), "no such file of poses", "SOURCE"),
         "a kind of nobody": (lambda: put(truth={"kind": "disparity"}), "kind", ""),
         "poses too few": (lambda: _poses(folder, put, "0 0 0 0 0 0 1\n"), "a pose for each of 3 views, got 1", "one line"),
-        "quaternion that is none": (lambda: _poses(folder, put, "0 0 0 1 2 3 4\n" * 3), "unit quaternion", "order"),
+        "quaternion that is none": (lambda: _poses(folder, put, "0 0 0 1 2 3 4\n" * 3), "pose 1: expected a unit quaternion", "order"),
         "poses that are words": (lambda: _poses(folder, put, "0 0 0 a b c d\n" * 3), "line 1", ""),
     }  # fmt: skip
 
