@@ -206,3 +206,30 @@ def test_no_home_is_named(monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="cannot be made"):
         settings.open_folder(tmp_path / "file" / "st")
+
+
+def test_a_command_ends_though_its_end_was_told_where_exceptions_are_lost():
+    """SIGTERM while an object goes raises what Python ignores; the command ends all the same, and only once."""
+    code = """
+import os, signal, sys, time
+from tofcapture.cli import doctor, main
+class Going:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        sum(range(1000))
+def slow():
+    try:
+        Going()
+        time.sleep(60)
+    finally:
+        time.sleep(0.3)
+        print("put away")
+doctor.check_weights = slow
+sys.exit(main(["doctor"]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=50
+    )
+    assert done.returncode == 143
+    assert done.stdout == "put away\n"
+    assert done.stderr.endswith("tofcapture: terminated\n  try: run the same command again to go on\n")

@@ -28,6 +28,7 @@ from tofcapture.cli.kit import Command, Outcome, at_work
 from tofcapture.errors import ConfigError, PassedOver, TofError, UsageError
 
 GROUP = "tofcapture.commands"
+_AGAIN = 0.05  # s
 EXIT_CODES = "exit codes: 0 ok, 1 unexpected, 2 usage, 3 config, 4 device, 5 data, 6 quality gate, 7 busy, 130 interrupted"
 DESCRIPTION = "Capture paired ToF raw data and stereo ground truth on a robot arm, build datasets, train networks on them."
 GROUPS = {
@@ -173,19 +174,36 @@ class _Terminated(KeyboardInterrupt):
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """Let SIGTERM end a command as Ctrl-C does; commands that have their own way, as the daemon, replace it."""
+    """Let SIGTERM end a command as Ctrl-C does; commands that have their own way, as the daemon, replace it.
+
+    What is raised in a callback of a library, or while an object goes, Python ignores: it is raised again until it is on its way.
+    """
 
     def end(number: int, _: object) -> None:
         signal.signal(number, signal.SIG_IGN)  # the second one must not break into the putting away
+        signal.signal(signal.SIGALRM, again)
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN, _AGAIN)
         raise _Terminated
 
-    ours = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGTERM, end) if ours else None
+    def again(*_: object) -> None:
+        error = sys.exc_info()[1]
+        while error is not None and not isinstance(error, _Terminated):
+            error = error.__context__
+        if error is None:
+            raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGALRM, signal.SIGTERM)}
+    signal.signal(signal.SIGTERM, end)
     try:
         yield
     finally:
-        if ours:
-            signal.signal(signal.SIGTERM, before)
+        if signal.getsignal(signal.SIGALRM) is again:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
