@@ -36,7 +36,7 @@ def stops(arm: str, layers: list[str], moments: range, folder: Path) -> Iterator
             file = franka_sim.station_file(folder, emulator.host)
         else:
             emulator.calm()
-            file = emulated.station_file(folder, emulator, "watchdog_hz = 1.0")
+            file = emulated.station_file(folder, emulator)
         for layer in layers:
             delays = [ms / 1e3 for ms in moments][:: max(1, 25 // moments.step) if layer == "daemon" else 1]
             trials = sweep(layer, emulator.host, file, delays)
@@ -51,7 +51,7 @@ def plans(models: list[str], seeds: int, folder: Path) -> Iterator[str]:
     for model in models:
         with Emulator(model=model) as emulator:
             emulator.order("haste", factor=10.0)
-            file = emulated.station_file(folder, emulator, f'model = "{model}"\nwatchdog_hz = 1.0')
+            file = emulated.station_file(folder, emulator, f'model = "{model}"')
             for scene, views in _PLANS:
                 done, motions, homes, turn = 0, 0, 0, 0.0
                 for seed in range(seeds):

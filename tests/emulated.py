@@ -31,7 +31,7 @@ fy = 60.0
 cx = 31.5
 cy = 24.5
 """
-# A UR arm, fast and hardly settling, and the cameras that follow it.
+# A UR arm, fast and hardly settling, and the cameras that follow it. A busy machine may not get round to its watchdog twice a second.
 STATION = (
     CAMERAS
     + """
@@ -42,6 +42,7 @@ speed = 1.0
 camera_speed = 1.5
 acceleration = 1.4
 settle = 0.05
+watchdog_hz = 1.0
 {more}
 [plan]
 table = -0.50

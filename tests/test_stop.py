@@ -25,7 +25,6 @@ from tofcapture.record.observer import Observer, Stopped
 from tofcapture.record.plan import plan_scene
 from tofcapture.record.recorder import record
 
-PATIENT = "watchdog_hz = 1.0"  # a busy machine may not get round to it twice a second
 ARM = "tests.misbehaving:Arm17"
 CONTEXT = StationContext({}, Path())
 AROUND = (-0.05, -0.005, 0.0, 0.01, 0.03, 0.1)  # s around the start of a move
@@ -232,7 +231,7 @@ needs_library = pytest.mark.skipif(
 @pytest.mark.parametrize(("layer", "delays"), [("host", AROUND), ("recorder", AROUND[2:5])])
 def test_stops_around_the_start_of_a_move(emulator, tmp_path, layer, delays):
     """With the real library on the emulated arm: at rest within 0.3 s of every stop, and the next move is refused."""
-    trials = sweep(layer, emulator.host, station_file(tmp_path, emulator, PATIENT), delays)
+    trials = sweep(layer, emulator.host, station_file(tmp_path, emulator), delays)
     assert len(trials) == len(delays)
     assert faults_of(trials) == []
 
@@ -243,6 +242,6 @@ def test_stops_around_the_start_of_a_move(emulator, tmp_path, layer, delays):
 def test_stops_at_every_layer(emulator, tmp_path, layer):
     """The whole sweep, in steps of 5 ms; for the daemon, whose trials are jobs of their own, of 25 ms."""
     delays = [ms / 1e3 for ms in range(-50, 151, 25 if layer == "daemon" else 5)]
-    trials = sweep(layer, emulator.host, station_file(tmp_path, emulator, PATIENT), delays)
+    trials = sweep(layer, emulator.host, station_file(tmp_path, emulator), delays)
     assert len(trials) == len(delays)
     assert faults_of(trials) == []

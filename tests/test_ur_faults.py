@@ -29,6 +29,7 @@ MOVING = {
 def _fault_in_motion(emulator, tmp_path, order):
     with open_station(station_file(tmp_path, emulator), allow_motion=True) as station:
         at_home(station.arm)
+        emulator.order("slow", speed=0.35)  # the watchdog is sooner than the arm
         emulator.order(order, share=0.3)
         with pytest.raises(MOVING[order]) as caught:
             station.arm.move_to(THERE)
