@@ -34,7 +34,6 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         part = kinds.add_parser(name, help=text, description=text)
         held, word = import_module(f"calibration.{module}"), name.replace("-", "_")
         getattr(held, f"configure_{word}")(part)
-        part.add_argument("--json", action="store_true", help="print the result as one JSON object")
         part.set_defaults(part=getattr(held, f"run_{word}"))
 
 

@@ -28,7 +28,7 @@ from tofcapture.cli.kit import Command, Outcome, at_work
 from tofcapture.errors import ConfigError, PassedOver, TofError, UsageError
 
 GROUP = "tofcapture.commands"
-_AGAIN = 0.05  # s
+_AGAIN = 0.05  # s, until SIGTERM is raised once more
 EXIT_CODES = "exit codes: 0 ok, 1 unexpected, 2 usage, 3 config, 4 device, 5 data, 6 quality gate, 7 busy, 130 interrupted"
 DESCRIPTION = "Capture paired ToF raw data and stereo ground truth on a robot arm, build datasets, train networks on them."
 GROUPS = {
@@ -150,8 +150,15 @@ def parser(commands: dict[str, Command], *, named: bool = True) -> argparse.Argu
         )
         if named:
             command.configure(sub)
-        sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
+        for each in (sub, *_parts(sub)):
+            each.add_argument("--json", action="store_true", help="print the result as one JSON object")
     return top
+
+
+def _parts(sub: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
+    """List the parsers of a command's parts, as of ``rig show``."""
+    chosen = (a.choices for a in sub._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001  argparse tells no other way
+    return [part for choices in chosen for part in choices.values()]
 
 
 def _run(argv: Sequence[str]) -> Outcome:

@@ -156,6 +156,7 @@ def _run(args: argparse.Namespace) -> Outcome:
             result.scenes |= one.scenes
             result.skipped += one.skipped
             result.warnings += one.warnings
+            result.placed &= one.placed
     for text in result.warnings:
         print(f"tofcapture: {text}", file=sys.stderr)
     data = {
@@ -169,12 +170,8 @@ def _run(args: argparse.Namespace) -> Outcome:
     lines += [f"{args.out}: {counted(len(result.scenes), 'scene')}, {counted(views, 'view')}"]
     if result.skipped:
         lines.append(f"{counted(len(result.skipped), 'scene')} already imported")
-    unplaced = f"tofcapture align {args.out} --initial none"
-    following = (
-        unplaced
-        if any(text.endswith(unplaced) for text in result.warnings)
-        else f"tofcapture build-dataset {args.out} --out dataset"
-    )
+    built, aligned = f"build-dataset {args.out} --out dataset", f"align {args.out} --initial none"
+    following = f"tofcapture {built if result.placed else aligned}"
     return Outcome(data, "\n".join(lines), following=following)
 
 
@@ -204,8 +201,6 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
     show = subs.add_parser("show", help="say what a rig holds", description="say what a rig holds")
     show.add_argument("camera", metavar="CAMERA", help=f"rig.toml, {_CAMERA}")
     show.add_argument("--size", **size)
-    for sub in subs.choices.values():
-        sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

@@ -81,7 +81,6 @@ def _configure_config(parser: argparse.ArgumentParser) -> None:
     station = "station (default: $TOFCAPTURE_STATION, else the simulated one)"
     add("--station", type=Path, metavar="STATION.toml", help=station)
     add("--seed", type=int, metavar="N", help="as record takes it")
-    add("--json", action="store_true", help="print the result as one JSON object")
 
 
 def _leaves(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

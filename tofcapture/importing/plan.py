@@ -70,31 +70,8 @@ CHANNEL = frozenset(
     ["c", "ch", "chan", "channel", "k", "tap", "taps", "phase", "p", "deg", "mhz", "hz", "dcs", "i"]
 )
 FRAME = frozenset(["f", "fr", "frame", "frames", "burst"])
-AXIS = (
-    TRUTH
-    | RAW
-    | CHANNEL
-    | FRAME
-    | frozenset(
-        [
-            "v",
-            "view",
-            "views",
-            "pose",
-            "poses",
-            "shot",
-            "img",
-            "image",
-            "n",
-            "no",
-            "npy",
-            "data",
-            "array",
-            "mm",
-            "cm",
-        ]
-    )
-)
+_PLAIN = "v view views pose poses shot img image n no npy data array mm cm"
+AXIS = TRUTH | RAW | CHANNEL | FRAME | frozenset(_PLAIN.split())
 MOST_NAMED = 5
 _FEW = 8  # arrays whose shapes are looked at before anything else
 SURFACES = (".ply", ".pcd", ".stl", ".obj")

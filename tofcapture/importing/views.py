@@ -50,9 +50,7 @@ class Imported:
     scenes: dict[str, int] = field(default_factory=dict)  #: Views by scene.
     skipped: list[str] = field(default_factory=list)  #: Scenes that were there already.
     warnings: list[str] = field(default_factory=list)  #: What looks wrong and may be right.
-    missing: list[str] = field(
-        default_factory=list
-    )  #: What these data do not have: ground truth, poses, stamps.
+    placed: bool = True  #: Whether it is known how the second camera stands; else ``align`` finds it.
 
 
 def said_of(source: Path, config: Path | None = None) -> Said:
@@ -171,6 +169,7 @@ def _import_view(out: Path, planned: Planned, said: Said, result: Imported, seen
     ):
         if text not in result.warnings:
             result.warnings.append(text)
+    result.placed &= placed
     if placed:
         _keep_rig(out, view.rig, overlap.model)
     write_view(path, replace(view, provenance={"import": inputs, "tofcapture": __version__}))

@@ -150,9 +150,8 @@ def from_arrays(
             hint="np.savez(path, raw=raw)",
         )
     raw = held[name][None] if held[name].ndim == 3 else held[name]
-    first = (
-        -3 if raw.ndim > 2 and raw.shape[-1] == K != raw.shape[-3] else -2
-    )  # channels that come last are told
+    last = raw.ndim > 2 and raw.shape[-1] == K != raw.shape[-3]  # channels that come last are told below
+    first = -3 if last else -2
     rig = tof_rig(rig_path, raw.shape[first:][:2] if raw.ndim > 2 else None) if rig_path else None
     camera = rig.tof if rig else NOMINAL_CAMERA
     plain = _described(facts, camera, saturation, path)

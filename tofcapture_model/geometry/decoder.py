@@ -19,8 +19,8 @@ from tofcapture.channels import frequencies, wrap_table
 from tofcapture.errors import DataError
 from tofcapture.frames import TofInfo
 from tofcapture.ops.phase import information
-from tofcapture.ops.phase.decoder import GROSS, RADIUS, most_odd, noisier, odd_beyond, rare
-from tofcapture.ops.phase.float32 import SURE, UNLIKELY, Correction, combine, sparse, tap_rows
+from tofcapture.ops.phase.decoder import GROSS, RADIUS, most_odd, odd_beyond, rare
+from tofcapture.ops.phase.float32 import SURE, UNLIKELY, Correction, tap_rows
 from tofcapture.ops.phase.noise import NoiseLine, NoiseMeter, stuck_lines
 from tofcapture.ops.phase.reference import UNKNOWN_CELSIUS
 from tofcapture.rig import RangeError
@@ -37,7 +37,7 @@ class Taps(NamedTuple):
     raw: Tensor  #: (K, H, W)
     celsius: Tensor  #: (), sensor temperature, NaN if unknown
     noise: Tensor  #: (3,), :class:`tofcapture.ops.phase.noise.NoiseLine`
-    noisier: Tensor  #: (F,) times the noise model's variance that each frequency shows, :func:`tofcapture.ops.phase.decoder.noisier`
+    noisier: Tensor  #: (F,) times the noise model's variance that each frequency shows, :class:`tofcapture.ops.phase.noise.NoiseMeter`
     stuck: Tensor  #: (H, W), 1 in lines that repeat others
 
 
@@ -85,7 +85,7 @@ class TorchDecoder:
 
         self._length, self._slant = there(camera.ray_lengths), there(camera.rays @ place / 2)
         rows = tap_rows(info)
-        self._rows, self._spare, self._sparse = there(rows.weights), rows.spare, sparse(rows.weights)
+        self._rows, self._spare = there(rows.weights), rows.spare
         U, self._tops = self._wraps.U, there(self._wraps.tops)
         weight = np.square(2 * np.pi / U) * known
         self._meter = NoiseMeter(info, self._wraps, [each.host for each in self._range], weight)
@@ -103,27 +103,13 @@ class TorchDecoder:
         device, raw = self._length.device, np.ascontiguousarray(raw)
         known = celsius if np.isfinite(celsius) else UNKNOWN_CELSIUS
         stated = self._info.noise
-        stuck = stuck_lines(raw)
+        stuck, saturated = stuck_lines(raw), np.asarray(self._info.saturated(raw).any(axis=0))
         line = NoiseLine.of(stated, 1) if stated else self._meter(raw[None], known, stuck)
-        told = celsius, line, self._noisier(raw, line), stuck.reshape(raw.shape[1:])
+        told = celsius, line, self._meter.noisier(raw, saturated, line), stuck.reshape(raw.shape[1:])
         return Taps(
             torch.from_numpy(np.ascontiguousarray(raw, dtype=np.float32)).to(device),
             *(torch.tensor(x, dtype=torch.float32).to(device) for x in told),
         )
-
-    def _noisier(self, raw: NDArray[Any], line: NoiseLine) -> list[float]:
-        """Measure on some pixels how noisy each frequency is beside what the model of the noise says."""
-        F, some = self._frequencies, raw.reshape(len(raw), -1)[:, self._meter.some]
-        rows = np.empty((len(self._rows), some.shape[1]), np.float32)
-        combine(np.ascontiguousarray(some), *self._sparse, rows)
-        power = np.square(rows[:F]) + np.square(rows[F : 2 * F])
-        mean = rows[2 * F] if self._info.offset else np.sqrt(power[-1])
-        variance = np.maximum(mean * line.slope + line.dark, line.least)
-        saturated = self._info.saturated(some.max(axis=0)) | self._info.saturated(some.min(axis=0))
-        return [
-            noisier(rows[first : first + count], own, variance, saturated) if count else 1.0
-            for own, (first, count) in zip(power, self._spare, strict=True)
-        ]
 
     def _inconsistent(
         self, rows: Tensor, power: Tensor, variance: Tensor, unsaturated: Tensor, taps: Taps
@@ -133,12 +119,10 @@ class TorchDecoder:
         for own, (first, count), times in zip(power, self._spare, taps.noisier, strict=True):
             if count:
                 misfit, noise = rows[first : first + count].square().sum(0), variance * times
-                limit = torch.maximum(
-                    variance * rare(count), torch.minimum(noise * rare(count), own * float(GROSS))
-                )
+                most = torch.minimum(noise * rare(count), own * float(GROSS))
                 odd = (misfit > noise * odd_beyond(count)) & unsaturated
-                lines = (odd.sum(d, keepdim=True) > most_odd(odd.shape[d]) for d in (0, 1))
-                out = out | (misfit > limit) | next(lines) | next(lines)
+                columns, lines = (odd.sum(d, keepdim=True) > most_odd(odd.shape[d]) for d in (0, 1))
+                out = out | (misfit > torch.maximum(variance * rare(count), most)) | columns | lines
         return out & unsaturated
 
     def __call__(self, taps: Taps) -> Frame:

@@ -182,9 +182,7 @@ class Link(limits.Link):
         busy = self._busy
         if busy is None or time.monotonic() < busy[1]:
             return None
-        if (
-            not self._receive.isConnected()
-        ):  # in mid-command: the library may wait for the answer all the same
+        if not self._receive.isConnected():  # the library may wait for the answer all the same
             return self._lost()
         return faults.ControllerSilent(f"{self._host}: {busy[0]} is not answered")
 

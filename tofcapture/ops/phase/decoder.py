@@ -19,7 +19,7 @@ from tofcapture.errors import DataError
 from tofcapture.frames import TofFlag, TofInfo
 from tofcapture.ops.phase import float32
 from tofcapture.ops.phase.float32 import Float32, correction
-from tofcapture.ops.phase.noise import NoiseLine, NoiseMeter, median_of_chi_squared, middle, stuck_lines
+from tofcapture.ops.phase.noise import NoiseLine, NoiseMeter, middle, stuck_lines
 from tofcapture.ops.phase.phasors import information
 from tofcapture.ops.phase.reference import UNKNOWN_CELSIUS
 from tofcapture.rig import RangeError
@@ -174,7 +174,7 @@ class Decoder:
         )  # fmt: skip
         shape = self.info.camera.shape
         image = depth.reshape(shape)
-        flags = self._flags(stuck, saturated).reshape(shape)
+        flags = self._flags(stuck, saturated, self._meter.noisier(raw, saturated, line)).reshape(shape)
         flags |= flying_pixels(image, self.info.camera, self._scratch).view(np.uint8) * np.uint8(
             TofFlag.FLYING
         )
@@ -197,17 +197,18 @@ class Decoder:
             self._weight, self._which.reshape(shape), self._doubt.reshape(shape),
         )  # fmt: skip
 
-    def _flags(self, stuck: NDArray[np.bool_], saturated: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """Raise all flags (H W,) but those of flying pixels."""
+    def _flags(
+        self, stuck: NDArray[np.bool_], saturated: NDArray[np.bool_], noisier: list[float]
+    ) -> NDArray[np.uint8]:
+        """Raise all flags (H W,) but those of flying pixels; ``noisier`` is what the meter says of each frequency."""
         flags = saturated.view(np.uint8) * np.uint8(TofFlag.SATURATED)
         flags |= self._doubt.view(np.uint8) * np.uint8(TofFlag.AMBIGUOUS)
         float32.dim(self._power, self._variance, self._uncertain, int(TofFlag.LOW_CONFIDENCE), flags)
         shape = self.info.camera.shape
-        odd, some = [np.zeros(n, np.int32) for n in shape], self._meter.some
-        for power, (first, count) in zip(self._power, self._spare, strict=True):
+        odd = [np.zeros(n, np.int32) for n in shape]
+        for power, (first, count), times in zip(self._power, self._spare, noisier, strict=True):
             if count:
                 spare = self._taps[first : first + count]
-                times = noisier(spare[:, some], power[some], self._variance[some], saturated[some])
                 float32.inconsistent(
                     spare, power, self._variance, saturated, np.float32(rare(count)), np.float32(odd_beyond(count)),
                     np.float32(times), GROSS, int(TofFlag.INCONSISTENT), flags, *odd,
@@ -217,16 +218,6 @@ class Decoder:
         if stuck.any():
             flags |= np.uint8(TofFlag.INCONSISTENT) * (stuck.ravel() & ~saturated)
         return flags
-
-
-def noisier(spare: Float32, power: Float32, variance: Float32, saturated: NDArray[np.bool_]) -> float:
-    """Tell how many times the variance that the noise model says a frame has, by the median of what no cosine explains.
-
-    ``spare`` (R, N) are combinations of taps that are noise alone, of pixels (N,).
-    """
-    lit = ~saturated & (power > 0)
-    ratio = (np.square(spare).sum(axis=0) / variance)[lit]
-    return max(1.0, middle(ratio) / (len(spare) * median_of_chi_squared(len(spare))))
 
 
 def most_odd(pixels: int) -> float:

@@ -153,7 +153,7 @@ class NoiseMeter:
         rows = float32.tap_rows(info)
         self._info, self._wraps, self._weight = info, wraps, weight[:, None]
         self._rows, self._F = float32.sparse(rows.weights), len(wraps.U)
-        self._rough = len(rows.weights) == 2 * self._F + 1
+        self._rough, self._spare = len(rows.weights) == 2 * self._F + 1, rows.spare
         W, pixels = info.camera.width, info.camera.width * info.camera.height
         some = np.arange(0, pixels, max(1, pixels // _SAMPLES) | 1)
         self.some = some[(some % W > 1) & (some % W < W - 2)] if self._rough else some
@@ -161,12 +161,9 @@ class NoiseMeter:
         self._taps = np.empty((len(rows.weights), len(self.some)), np.float32)
         self._ranges, self._power = np.empty((2, self._F, len(self.some)), np.float32)
 
+    @np.errstate(invalid="ignore", over="ignore")
     def __call__(self, raw: NDArray[Any], celsius: float, stuck: NDArray[np.bool_]) -> NoiseLine:
         """Measure the variance of the mean of frames (frames, K, H, W), but where taps are ``stuck`` (H, W)."""
-        with np.errstate(invalid="ignore", over="ignore"):
-            return self._measured(raw, celsius, stuck)
-
-    def _measured(self, raw: NDArray[Any], celsius: float, stuck: NDArray[np.bool_]) -> NoiseLine:
         frames, K = raw.shape[:2]
         taps = raw.reshape(frames, K, -1)[:, :, self.some]
         seen = taps[0] if frames == 1 else taps.mean(axis=0, dtype=np.float64)
@@ -198,6 +195,25 @@ class NoiseMeter:
         # What is not smooth may be the scene. Then the frequencies agree far better than such noise lets them.
         share = min(1.0, _ROUGH * self._disagreement(lit, line.at(mean)))
         return NoiseLine(line.slope * share, line.dark * share, max(line.least * share, least))
+
+    @np.errstate(invalid="ignore", over="ignore")
+    def noisier(self, raw: NDArray[Any], saturated: NDArray[np.bool_], line: NoiseLine) -> list[float]:
+        """Tell for each frequency how many times the variance of ``line`` a frame has, by the median of what no cosine explains.
+
+        ``raw`` (K, H, W) are taps of a frame, or of the mean of some, ``saturated`` (H, W) its pixels that are. 1 where three phases
+        explain anything.
+        """
+        F, some = self._F, raw.reshape(len(raw), -1)[:, self.some]
+        float32.combine(some, *self._rows, self._taps)
+        power = np.square(self._taps[:F]) + np.square(self._taps[F : 2 * F])
+        mean = self._taps[2 * F] if self._info.offset else np.sqrt(power[-1])
+        variance = line.at(mean)
+        out = []
+        for own, (first, count) in zip(power, self._spare, strict=True):
+            lit = ~saturated.ravel()[self.some] & (own > 0)
+            ratio = (np.square(self._taps[first : first + count]).sum(axis=0) / variance)[lit]
+            out.append(max(1.0, middle(ratio) / (count * median_of_chi_squared(count))) if count else 1.0)
+        return out
 
     def _disagreement(self, lit: NDArray[np.bool_], variance: NDArray[Any]) -> float:
         """Tell how many times the variance of lit pixels the misfit of their likeliest wraps shows."""
