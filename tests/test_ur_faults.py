@@ -20,7 +20,8 @@ MOVING = {
     "protective_stop": faults.ProtectiveStop,
     "emergency_stop": faults.EmergencyStop,
     "script_death": faults.ProgramStopped,
-    "drop": faults.LinkLost,
+    # The library itself may crash when a cable is cut in mid-move; its process is lost then, and all else holds.
+    "drop": (faults.LinkLost, faults.HostLost),
     "freeze": faults.StaleData,
     "nan": faults.StaleData,
 }
