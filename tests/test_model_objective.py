@@ -124,3 +124,7 @@ def test_an_image_counts_by_the_inverse_of_its_sensor_s_error_and_a_wrap_not_at_
     assert pull(0.05) == pytest.approx(pull(0.2), rel=0.2)
     assert pull(0.002) < 0.5 * pull(0.05)
     assert pull(2.0) == 0
+    # below delta the loss is a parabola, which the share makes a line
+    assert pull(0.004) == pytest.approx(pull(0.0011) * (4 / 1.1), rel=0.2)
+    losses = replace(losses, reweight=True)  # lambda, as in the paper, is the only weight then
+    assert pull(0.2) == pytest.approx(4.3 * pull(0.05), rel=0.1)

@@ -1,4 +1,4 @@
-"""A camera of other size, frequencies and phases: what reads it, what refuses it, and that fine-tuning to it helps."""
+"""A camera of other size, frequencies and phases: what reads it, and that fine-tuning to it helps."""
 
 # ruff: noqa: E402  torch is optional
 from __future__ import annotations
@@ -25,6 +25,7 @@ from tofcapture.rig import SPEED_OF_LIGHT
 from tofcapture_model.config import Config, Network, Stage, preset
 from tofcapture_model.data import batched, make_frame
 from tofcapture_model.evaluation.evaluate import evaluate
+from tofcapture_model.frame import eight_taps
 from tofcapture_model.networks import build_model
 from tofcapture_model.networks.checkpoint import find_model
 from tofcapture_model.training.train import train
@@ -63,14 +64,32 @@ def test_six_channels_are_decoded_and_read_by_compact():
 
 
 @pytest.mark.parametrize("kind", ["paper", "guo2018"])
-def test_networks_of_raw_channels_say_that_they_want_eight(kind):
-    """They were made for eight; the error names another preset. Without raw among its inputs, the paper's network runs."""
+def test_networks_of_eight_raw_channels_read_six(kind):
+    """They get the eight that the camera's phasors would have made, and answer at twice the size."""
     frame = batched(wall()[0])
-    with torch.no_grad(), pytest.raises(ConfigError, match=r"expected 8 raw channels, got 6.*") as caught:
-        small(kind)(frame)
-    assert "compact" in str(caught.value.hint)
+    raw, demodulation = eight_taps(frame)
+    assert raw.shape[1] == 8
+    torch.testing.assert_close(
+        torch.einsum("bpc,bchw->bphw", demodulation, raw), frame.phasor, atol=1e-6, rtol=0
+    )
+    torch.testing.assert_close(raw[:, :4].mean(1), frame.raw.mean(1))
     with torch.no_grad():
-        assert small("paper", inputs=("depth", "confidence"))(frame).depth.shape[-1] == 320
+        assert small(kind)(frame).depth.shape[-1] == 320
+
+
+def test_eight_taps_are_those_of_the_papers_camera():
+    """Phases a quarter apart, the lowest frequency first: what its sensor gives is what its phasors make."""
+    depth = 0.7
+    camera = Camera(40, 30, 33.0, 33.0, 19.5, 14.5)
+    info = TofInfo("paper", "0", camera, np.zeros(3))
+    turns = 4 * np.pi * depth / SPEED_OF_LIGHT * np.array([20e6, 100e6])
+    phasor = np.broadcast_to(500 * np.exp(1j * turns)[:, None, None], (2, *camera.shape))
+    raw = taps(phasor, np.full(phasor.shape, 800.0), info.modulation_hz, info.phase_rad)
+    frame = batched(make_frame(raw, info, camera))
+    assert eight_taps(frame)[0] is frame.raw
+    made, told = eight_taps(frame._replace(raw=frame.raw.mean(1, keepdim=True)))
+    torch.testing.assert_close(made, frame.raw, atol=1e-6, rtol=0)
+    torch.testing.assert_close(told, frame.demodulation[:, :4], atol=1e-6, rtol=0)
 
 
 def stand_in(folder):

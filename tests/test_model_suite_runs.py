@@ -5,28 +5,20 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import partial
 
-import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
-from tests import analytic
 from tests.analytic import make_dataset
 from tofcapture.cli import main
 from tofcapture.files.manifest import load_manifest, write_manifest
-from tofcapture.frames import TofInfo
 from tofcapture_model.config import preset
 from tofcapture_model.evaluation import evaluate, suite
 from tofcapture_model.evaluation.tables import SUITES, Column, Suite, cells, write_tables
 from tofcapture_model.networks import build_model
 from tofcapture_model.networks.checkpoint import find_model, learned_from, save_model
 
-SIX = {
-    "modulation_hz": (20e6,) * 3 + (100e6,) * 3,
-    "phase_rad": tuple(2 * np.pi * k / 3 for k in range(3)) * 2,
-}
 COLUMN = Column("mm", ("mae",))
 
 
@@ -40,11 +32,11 @@ def dataset(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def weights(dataset, tmp_path_factory):
-    """Two untrained networks that remember the training scene, and one that wants eight raw channels."""
+    """Three untrained networks that remember the training scene."""
     folder = tmp_path_factory.mktemp("suite-runs")
-    for name, kind, seed in (("one", "compact", 1), ("two", "compact", 2), ("eight", "paper", 1)):
+    for name, seed in (("one", 1), ("two", 2), ("three", 3)):
         torch.manual_seed(seed)
-        base = preset("demo" if kind == "compact" else kind)
+        base = preset("demo")
         config = replace(base, network=replace(base.network, width=4, levels=2))
         model = build_model(config)
         for p in model.parameters():
@@ -102,17 +94,14 @@ def test_an_out_that_cannot_be_written_is_refused_before_measuring(dataset, weig
 
 
 @pytest.mark.usefixtures("nothing_is_measured")
-def test_a_network_that_does_not_fit_the_camera_is_told_before_measuring(
-    weights, tmp_path, capsys, monkeypatch
-):
-    """The second of two networks wants eight raw channels of a camera that has six."""
-    monkeypatch.setattr(analytic, "TofInfo", partial(TofInfo, **SIX))
-    six = make_dataset(tmp_path / "six", views=1, frames=1, scale=8, splits=("test",))
-    words = ("--suite", "main", "--weights", f"one={weights / 'one'}", f"wrong={weights / 'eight'}")
-    assert evaluated(six, tmp_path / "r.json", *words) == 3
-    said = capsys.readouterr().err
-    assert f"wrong={weights / 'eight'}" in said
-    assert "expected 8 raw channels, got 6" in said
+def test_damaged_weights_are_told_before_measuring(dataset, weights, tmp_path, capsys):
+    """The second of two networks lacks its end."""
+    whole = (weights / "two" / "model.safetensors").read_bytes()
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes(whole[:-1000])
+    words = ("--suite", "main", "--weights", f"one={weights / 'one'}", f"wrong={cut}")
+    assert evaluated(dataset, tmp_path / "r.json", *words) == 5
+    assert str(cut) in capsys.readouterr().err
 
 
 def test_an_interrupted_suite_goes_on(dataset, weights, tmp_path, capsys, measured, monkeypatch):
@@ -154,7 +143,7 @@ def test_runs_of_other_conditions_are_measured_anew(dataset, weights, tmp_path, 
 
     assert again() == every
     assert again() == []
-    assert again("--weights", f"one={weights / 'two'}", f"two={weights / 'eight'}") == ["two"]
+    assert again("--weights", f"one={weights / 'two'}", f"two={weights / 'three'}") == ["two"]
     assert again("--frames", "1") == every
     assert again("--frames", "1", "--scenes", "scene-2") == every
     assert again("--frames", "1", "--scenes", "scene-2") == []

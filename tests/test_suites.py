@@ -147,6 +147,21 @@ def test_kinds_replace_the_pattern_and_every_mesh_has_its_turn(tmp_path):
             wrong.recipe()
 
 
+@pytest.mark.parametrize(("kind", "low", "high"), [("black", 0.03, 0.12), ("white", 0.75, 0.92)])
+def test_a_room_may_be_black_or_white(kind, low, high):
+    """Table, floor and walls have one albedo then, another in every scene; objects and sheets keep theirs."""
+    spec = DatasetSpec("tof100", 0, 6, kinds=(kind,))
+    seen = []
+    for i in range(6):
+        scene = make_scene(spec.recipe(), i, 0)
+        around = {float(o.albedo) for o in scene.objects if not o.target and o.name != "sheet"}
+        assert len(around) == 1
+        assert low <= min(around) <= high
+        seen += around
+        assert not around & {float(o.albedo) for o in scene.objects if o.target}
+    assert len(set(seen)) == 6
+
+
 def test_noise_levels_change_the_sensor_alone():
     """The levels of a base scene share objects, poses and split, and differ in exposure or ambient light."""
     levels = len(load_recipe("noise").table["level"])

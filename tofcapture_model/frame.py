@@ -7,10 +7,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tofcapture.errors import ConfigError
-
 # m; a decoded depth beyond them is an unwrapping failure on this rig and counts as a hole
 MIN_RANGE, MAX_RANGE = 0.05, 5.0
+
+
+_EIGHT = 8
+# of B + A cos(phi + k pi / 2), k = 0 to 3
+_QUARTERS = torch.tensor([[0.5, 0.0, -0.5, 0.0], [0.0, -0.5, 0.0, 0.5]])
 
 
 class Frame(NamedTuple):
@@ -64,16 +67,18 @@ class Estimate(NamedTuple):
     trust: Tensor | None = None
 
 
-def expect_channels(raw: Tensor, channels: int, network: str) -> None:
-    """Refuse another camera's raw channels (B, K, H, W) than a network was made for.
+def eight_taps(frame: Frame) -> tuple[Tensor, Tensor]:
+    """Give any camera the raw channels of the paper's: four phases, a quarter apart, of the lowest and of the highest frequency.
 
-    Raises :class:`ConfigError`: ``raw`` has not ``channels`` channels.
+    Returns taps (B, 8, H, W) and the weights (B, 4, 8) that turn them into I and Q of both frequencies. Eight channels are what the camera
+    has; fewer or more are replaced by those that its phasors and the mean of its taps would have made.
     """
-    if raw.shape[1] != channels:
-        raise ConfigError(
-            f"{network}: expected {channels} raw channels, got {raw.shape[1]} from this camera",
-            hint="take the preset compact, which reads phasors, or one of the network's inputs other than raw",
-        )
+    if frame.raw.shape[1] == _EIGHT:
+        return frame.raw, frame.demodulation[:, :4]
+    offset = frame.raw.mean(1, keepdim=True)
+    weights = torch.kron(torch.eye(2), _QUARTERS).to(frame.raw)
+    taps = offset + 2 * torch.einsum("pk,bphw->bkhw", weights, frame.phasor)
+    return taps, weights.expand(len(frame.raw), -1, -1)
 
 
 def frame_to(frame: Frame, device: torch.device) -> Frame:

@@ -67,7 +67,7 @@ def _configure_dataset(parser: argparse.ArgumentParser) -> None:
         ("--jobs", None, "processes (default: one per core)"),
     ):
         add(name, type=int, metavar="N", default=default, required=name == "--scenes", help=text)
-    kinds = "object, combination, concave, corner, bright, dark, mesh"
+    kinds = "object, combination, concave, corner, bright, dark, mesh, black, white"
     text = f"kinds of scenes, in turns, instead of the recipe's (tof100): {kinds}"
     add("--kinds", nargs="+", default=(), metavar="KIND", help=text)
     add("--meshes", type=Path, metavar="DIR", help="meshes for a tenth of the scenes (tof100)")

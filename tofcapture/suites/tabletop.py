@@ -84,7 +84,7 @@ def _scene(
         *targets,
         *_panels(int(table.get("panels", 0)), rng, albedo),
         *_sheets(int(recipe.table["sheets"]), recipe.table["materials"], rng),
-        *surroundings(name, seed, clutter=True),
+        *_painted(surroundings(name, seed, clutter=True), table.get("surroundings"), rng),
     ]
     return Scene(
         name=name,
@@ -142,6 +142,17 @@ def _sheets(most: int, materials: Mapping[str, Any], rng: np.random.Generator) -
         mesh = cuboid(float(x), float(y), _SHEET * (1 + k / 4))
         out.append(solid("sheet", mesh, albedo(rng), place, (0, 0, rng.uniform(-np.pi, np.pi))))
     return out
+
+
+def _painted(
+    around: Sequence[SceneObject], albedo: Sequence[float] | None, rng: np.random.Generator
+) -> list[SceneObject]:
+    """Give table, floor and walls one albedo of a range, where the kind of scene has one: a black or a white room."""
+    if albedo is None:
+        return list(around)
+    low, high = albedo
+    one = float(rng.uniform(low, high))
+    return [replace(o, albedo=one) for o in around]
 
 
 def table_meshes(folder: Path, mesh_unit: str, seed: int) -> tuple[tuple[Path, ...], tuple[Path, ...]]:

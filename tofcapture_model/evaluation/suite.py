@@ -257,8 +257,7 @@ def measure_runs(
 
     Returns results; lengths in metres.
 
-    Raises :class:`ConfigError`: no scene of the split begins so, or a network that does not fit the camera;
-    :class:`FormatError`: weights that are not there.
+    Raises :class:`ConfigError`: no scene of the split begins so; :class:`FormatError`: weights that are damaged or not there.
 
     Parameters
     ----------
@@ -281,10 +280,11 @@ def measure_runs(
     """
     target_device = torch.device(device)
     runs = [(name, i, find_model(path)) for name, paths in weights.items() for i, path in enumerate(paths)]
+    for _, _, path in runs:  # so that what is wrong with one is said before hours of measuring
+        load_checkpoint(path)
     data = FrameDataset(dataset, split, frames=frames, cache_bytes=spare_memory())  # every run asks again
     measured = take_scenes(data, split, scenes)
     count = len(data.samples)
-    _expect_fit([(name, path) for name, _, path in runs], data, target_device)
     known = RunFile(kept, _conditions(dataset, split, frames, scenes, device))
 
     def part(nth: int) -> Callable[[int, int], None]:
@@ -330,17 +330,6 @@ def measure_runs(
         "methods": {name: mean for name, (mean, _) in table.items()},
         "spread": {name: spread for name, (_, spread) in table.items() if len(weights.get(name, ())) > 1},
     }
-
-
-@torch.no_grad()
-def _expect_fit(runs: Sequence[tuple[str, Path]], data: FrameDataset, target_device: torch.device) -> None:
-    """Have every network answer one frame, so that what is wrong with it is said before hours of measuring."""
-    frame = frame_to(batched(data.frame(data.samples[0])), target_device)
-    for name, path in runs:
-        try:
-            load_checkpoint(path)[0].to(target_device)(frame)
-        except ConfigError as err:
-            raise ConfigError(f"{name}={path}: {err.message}", hint=err.hint) from err
 
 
 def seen_before(results: Mapping[str, Any]) -> str:

@@ -23,6 +23,7 @@ from tofcapture_model.networks.joint import CompactModel, JointModel, PaperModel
 from tofcapture_model.networks.unet import UNet
 
 Model = JointModel | Baseline
+_LEAST_SHARE = 0.2  # of delta that a sensor's error is taken for
 _WRAPPED = 0.3  # m by which a depth is wrong that was unwrapped wrongly
 
 PARTS = {
@@ -88,7 +89,8 @@ def training_loss(
     if isinstance(model, Baseline):
         loss = model.loss(estimate, target, frame)
         return Objective(loss, {"depth": loss}, torch.zeros(7))
-    target, share = _weighed(target, frame, weights.delta)
+    target, inverse = _weighed(target, frame, weights.delta)
+    share = None if weights.reweight else inverse  # lambda of eq. 1 is the paper's own weight
     return objective(weights, stage, estimate, target, scale_intrinsics(frame.intrinsics, 2), share)
 
 
@@ -96,7 +98,7 @@ def _weighed(target: Target, frame: Frame, delta: float) -> tuple[Target, Tensor
     """Leave out what was measured a wrap away, and let an image count by the inverse of its sensor's error, (B, 1, 1, 1).
 
     No network moves a depth by a wrap, and one such pixel outweighs hundreds. A camera of centimetres must not outweigh ten of
-    millimetres.
+    millimetres: what counts is the share of its sensor's error that a network leaves.
     """
     decoded, valid = (F.interpolate(x, scale_factor=2, mode="nearest") for x in (frame.depth, frame.valid))
     wrong = (decoded - target.depth).abs()
@@ -105,4 +107,6 @@ def _weighed(target: Target, frame: Frame, delta: float) -> tuple[Target, Tensor
     mean = (wrong.clamp_max(_WRAPPED) * good).sum((1, 2, 3), keepdim=True) / good.sum(
         (1, 2, 3), keepdim=True
     ).clamp_min(1)
-    return target._replace(good=good, context=target.context & near), 1 / (mean / delta).clamp_min(1)
+    return target._replace(good=good, context=target.context & near), 1 / (mean / delta).clamp_min(
+        _LEAST_SHARE
+    )

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from tofcapture_model.config import SOURCES, Network
-from tofcapture_model.frame import Frame, expect_channels
+from tofcapture_model.frame import Frame, eight_taps
 from tofcapture_model.geometry.maps import (
     depth_to_normals,
     doubled_parts,
@@ -79,10 +79,9 @@ class PaperInputs(nn.Module):
         self.channels = sum(SOURCES[s] for s in sources)
 
     def forward(self, frame: Frame) -> Features:
-        """Take the chosen sources of a frame as they are; normals start towards the camera."""
-        if "raw" in self.sources:
-            expect_channels(frame.raw, SOURCES["raw"], "paper")
-        image = torch.cat([getattr(frame, s) for s in self.sources], dim=1)
+        """Take the chosen sources of a frame; normals start towards the camera."""
+        taken = {"raw": eight_taps(frame)[0], "confidence": frame.confidence, "depth": frame.depth}
+        image = torch.cat([taken[s] for s in self.sources], dim=1)
         r = rays(frame.intrinsics, *frame.depth.shape[-2:])
         return Features(image, frame.depth[:, :0], None, None, -unit(r), r)
 

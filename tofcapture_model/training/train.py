@@ -40,10 +40,8 @@ from tofcapture_model.training.card import write_card
 
 WARM_UP = 0.02  # of a stage, with a cosine schedule
 MAX_NORM = 1.0  # of the gradient
-_UNCALIBRATED, _UNCALIBRATED_RAD = (
-    0.12,
-    0.03,
-)  # share of frames of a camera that nobody calibrated, and its error
+_UNCALIBRATED = 0.15  # share of frames of a camera that nobody calibrated
+_UNCALIBRATED_RAD = (0.01, 0.1)  # its error, from a sine's to a square wave's
 _REMEMBERED = 300  # samples whose values a network remembers as familiar
 
 
@@ -173,7 +171,9 @@ class Learner:
         if self.training.phase_error:
             size = (len(frame.depth), 1, 1, 1)
             nobody = torch.rand(size, generator=drawn, device=self.group.device) < _UNCALIBRATED
-            radians = torch.where(nobody, _UNCALIBRATED_RAD, self.training.phase_error)
+            low, high = map(math.log, _UNCALIBRATED_RAD)
+            error = (low + (high - low) * torch.rand(size, generator=drawn, device=self.group.device)).exp()
+            radians = torch.where(nobody, error, self.training.phase_error)
             frame = redraw_calibration(frame, drawn, radians)
         return frame
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from tofcapture_model.frame import Estimate, Frame, Target, expect_channels
+from tofcapture_model.frame import Estimate, Frame, Target, eight_taps
 from tofcapture_model.losses import masked_mean
 from tofcapture_model.networks.baselines import Baseline, decode
 from tofcapture_model.networks.unet import pad_to_multiple
@@ -55,11 +55,11 @@ class MRM(Baseline):
 
     def estimate_depth(self, frame: Frame) -> Tensor:
         """Decode the mixed channels, relative to the frame's own decoding: calibration stays the camera's."""
-        expect_channels(frame.raw, self.channels, "guo2018")
-        kernels = self.kernels(frame.raw).float()
-        with torch.autocast(frame.raw.device.type, enabled=False):
-            mixed = torch.einsum("bcihw,bchw->bihw", kernels, frame.raw)
-            low, high = torch.einsum("bpc,bchw->bphw", frame.demodulation[:, :4], mixed).chunk(2, dim=1)
+        raw, demodulation = eight_taps(frame)
+        kernels = self.kernels(raw).float()
+        with torch.autocast(raw.device.type, enabled=False):
+            mixed = torch.einsum("bcihw,bchw->bihw", kernels, raw)
+            low, high = torch.einsum("bpc,bchw->bphw", demodulation, mixed).chunk(2, dim=1)
         return decode(frame, low, high)[0]
 
     def kernels(self, raw: Tensor) -> Tensor:
