@@ -1,7 +1,7 @@
 """Ground truth against the simulator's exact depth, per mask class, over scenes that are hard in different ways.
 
     python -m benchmarks.ground_truth [--seed 0] [--scenes rods,dark,...] [--distances 0.45,0.8,1.4]
-    python -m benchmarks.ground_truth --fused 25 [--seed 0] [--scenes mug,...]
+    python -m benchmarks.ground_truth --fused 25 [--seed 0] [--scenes mug,...] [--poses off] [--recordings FOLDER]
 
 Every scene is seen by cameras of full size with all of the stereo camera's errors, from three directions, with the true rig,
 so that the figures are those of denoising, projection, normals and crop alone. Printed per scene and for all: median and 99th
@@ -16,7 +16,8 @@ ours, and Open3D's statistical and radius outlier removal.
 them, built twice, with exact poses and with an arm that repeats to 0.1 mm (and 0.1 mrad) beside a hand-eye transform that is
 0.5 mm and 0.1 degrees off. Asked for are the object's pixels that any stereo view measured, real depth edges apart; by class: rim
 (within 4 ToF pixels of an edge), shadow (not hit or occluded for the own stereo camera), hollow (0.5 mm deeper than 8 pixels
-about it), flat (the rest).
+about it), flat (the rest). ``ause`` is the area between two sparsification curves, of errors in the order of sigma, or of depth,
+and in their own order, in mean errors: 0 is perfect. ``--recordings`` keeps what is simulated for the next time.
 """
 
 from __future__ import annotations
@@ -305,17 +306,29 @@ def asked(views: list[View], index: int) -> dict[str, np.ndarray]:
             "flat": everything & ~near & ~hollow}  # fmt: skip
 
 
-def compare(name: str, seed: int, count: int, folder: Path) -> None:
-    """Print single and fused truth of one scene, with exact poses and with bad ones."""
-    planned(name, seed, count, folder / "exact")
-    disturbed(folder / "exact", name, seed, folder / "off")
-    views = [open_view(p) for p in sorted((folder / "exact/views" / name).glob("view-*.h5"))]
+def sparsified(error: np.ndarray, by: np.ndarray) -> float:
+    """Area between the sparsification curve by a key and the best there is, in mean errors; NaN with infinite errors."""
+    shares = np.arange(1, 21) * len(error) // 20
+    curves = []
+    for key in (by, error):
+        best = np.cumsum(error[np.argsort(key, kind="stable")], dtype=float)
+        curves.append(best[shares - 1] / shares)
+    with np.errstate(invalid="ignore"):
+        return float((curves[0] - curves[1]).mean() / error.mean())
+
+
+def compare(name: str, seed: int, count: int, kept: Path, poses_of: tuple[str, ...], folder: Path) -> None:
+    """Print single and fused truth of one scene, with exact poses and with bad ones; ``kept`` holds its recordings."""
+    if not (kept / "off/rig.toml").exists():
+        planned(name, seed, count, kept / "exact")
+        disturbed(kept / "exact", name, seed, kept / "off")
+    views = [open_view(p) for p in sorted((kept / "exact/views" / name).glob("view-*.h5"))]
     classes = [asked(views, k) for k in range(len(views))]
-    single = build_dataset([folder / "exact"], folder / "single", config=SampleConfig(truth="single"), jobs=1)
-    for poses in ("exact", "off"):
+    single = build_dataset([kept / "exact"], folder / "single", config=SampleConfig(truth="single"), jobs=1)
+    for poses in poses_of:
         start = time.process_time()
         built = build_dataset(
-            [folder / poses], folder / f"fused-{poses}", config=SampleConfig(truth="fused"), jobs=1
+            [kept / poses], folder / f"fused-{poses}", config=SampleConfig(truth="fused"), jobs=1
         )
         seconds = (time.process_time() - start) / len(views)
         print(f"{name}, {len(views)} views, poses {poses}: {seconds:.2f} s of CPU a view, "
@@ -346,25 +359,26 @@ def _print(single: Path, fused: Path, views: list[View], classes: list[dict[str,
             }
             for title, where in parts.items():
                 some = where & good
-                row = np.stack([error[some], error[some] / all_of_them.sigma[some], all_of_them.sigma[some]])
+                sigma = all_of_them.sigma[some]
+                row = np.stack([error[some], error[some] / sigma, sigma, all_of_them.depth[some]])
                 found.setdefault(title, []).append(row)
                 counts = found.setdefault(f"{title}#", [])
                 counts.append(np.array([where.sum(), (where & was).sum(), some.sum()], dtype=float))
             alone = np.abs(one.depth - view.truth.depth)[was]
-            found.setdefault("single", []).append(np.stack([alone, alone, alone]))
+            found.setdefault("single", []).append(np.stack([alone] * 4))
     cover = np.array(covers)
     print(f"  of what was asked for: single {cover[:, 0].mean():.1%} (worst {cover[:, 0].min():.1%}), fused {cover[:, 1].mean():.1%} "
           f"(worst {cover[:, 1].min():.1%}); single, of the whole object {cover[:, 2].mean():.1%}; seen through {through}")  # fmt: skip
     for title in (t for t in found if not t.endswith("#")):
-        error, ratio, sigma = np.concatenate(found[title], axis=1)
+        error, ratio, sigma, depth = np.concatenate(found[title], axis=1)
         if not len(error):
             continue
         counts = np.sum(found.get(f"{title}#", [np.array([np.nan] * 3)]), axis=0)
         median, p99 = np.percentile(error, [50, 99], method="nearest") * 1e3
-        surest = np.argsort(sigma, kind="stable")[: len(sigma) // 2]
+        by_sigma, by_depth = (sparsified(error, key) for key in (sigma, depth))
         print(f"  {title:<8} {len(error):>8} px  single {counts[1] / counts[0]:6.1%} fused {counts[2] / counts[0]:6.1%}  median {median:6.4f} mm  "
               f"p99 {p99:6.3f} mm  worst {1e3 * error.max():6.2f}  within one sigma {np.mean(ratio < 1):6.1%}  "
-              f"surer half: mean {1e3 * error[surest].mean():.4f} of {1e3 * error.mean():.4f} mm")  # fmt: skip
+              f"ause {by_sigma:.3f}, by depth {by_depth:.3f}")  # fmt: skip
 
 
 def main() -> None:
@@ -375,11 +389,16 @@ def main() -> None:
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--distances", default=",".join(map(str, DISTANCES)))
     parser.add_argument("--fused", type=int, metavar="N", help="views of each scene, built single and fused")
+    parser.add_argument("--poses", default="exact,off", help="which of them are built")
+    parser.add_argument(
+        "--recordings", type=Path, metavar="FOLDER", help="of simulated views, to be used again"
+    )
     args = parser.parse_args()
     if args.fused:
         for name in args.scenes.split(","):
             with tempfile.TemporaryDirectory() as folder:
-                compare(name, args.seed, args.fused, Path(folder))
+                kept = Path(folder) if args.recordings is None else args.recordings / name
+                compare(name, args.seed, args.fused, kept, tuple(args.poses.split(",")), Path(folder))
         return
     distances = tuple(float(d) for d in args.distances.split(","))
     everything, crops, angles, removed = {}, [], [], {}

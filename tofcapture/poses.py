@@ -143,6 +143,13 @@ def exp(xi: ArrayLike) -> Float64:
     return transform(rotation_exp(phi), V @ rho)
 
 
+def adjoint(T: Float64) -> Float64:
+    """Return (6, 6) what takes twists (6,) of a frame to that which ``T`` maps it to: ``T exp(xi) = exp(adjoint(T) xi) T``."""
+    out = np.kron(np.eye(2), T[:3, :3])
+    out[:3, 3:] = hat(T[:3, 3]) @ T[:3, :3]
+    return out
+
+
 def log(T: Float64) -> Float64:
     """Invert :func:`exp`: transform to twist (6,)."""
     phi = rotation_log(T[:3, :3])

@@ -21,11 +21,11 @@ from tofcapture.frames import View
 from tofcapture.ops.crop import WHOLE, Crop, crop_depth, find_crop
 from tofcapture.ops.denoise import denoise
 from tofcapture.ops.fuse import INNER, SURFACE, TARGET, Clouds, Hits, fuse, meet
-from tofcapture.ops.normals import PlaneField
+from tofcapture.ops.normals import RADII, PlaneField, alike_pixels
 from tofcapture.ops.project import Projection, Sheet, edges, place_hits, triangulate
-from tofcapture.ops.register import Samples, register, spread
+from tofcapture.ops.register import Samples, register
 from tofcapture.pool import Pool
-from tofcapture.poses import Float64, invert, rotate_vectors, transform_points
+from tofcapture.poses import Float64, adjoint, invert, rotate_vectors, transform_points
 from tofcapture.rig import Rig
 
 SPARSE = 4  # pixels between points that vote for the table
@@ -34,9 +34,8 @@ MARGIN = 12  # cells about the object
 ABOUT = 0.02  # m, about the object, that are fused with it
 PLACES = 600, 300  # sampled planes of the object and of what is about it
 LENS_FINER = 3  # times as fine a pinhole image is what a lens is looked up in
-CORRELATED_LAG = 2  # pixels, at which the noise's correlation is measured
 APART = "it does not see what the others see: the object moved, or its pose is wrong"
-MOST = 1000.0  # pixels whose noise is one
+PLANE = 3  # numbers that a plane has
 
 
 @dataclass(frozen=True)
@@ -61,8 +60,8 @@ class Surface:
         (N, 4, 4) of the stereo cameras, refined.
     group
         (N,) views of one number see one surface.
-    pose_sigma
-        (N, N) metres, by which one view's surface is off another's through both poses.
+    covariance
+        (6 N, 6 N) of the poses' twists, each in its own stereo frame, metres and radians.
     bounds
         (N, 2, 3) least and largest coordinates of each group's object, base frame, metres.
     alone
@@ -72,13 +71,24 @@ class Surface:
     folder: Path
     poses: Float64
     group: NDArray[np.intp]
-    pose_sigma: Float64
+    covariance: Float64
     bounds: Float64
     alone: Mapping[int, str]
 
     def members(self, view: int) -> NDArray[np.intp]:
         """Number the views that a view's truth is made of."""
         return np.flatnonzero(self.group == self.group[view])
+
+    def relative(self, view: int, T: Float64) -> Float64:
+        """Tell the covariance (N, 6, N, 6) of how all surfaces lie in one view's frame, as twists in a frame that ``T`` maps it to."""
+        count = len(self.poses)
+        J = np.zeros((count, 6, count, 6))
+        for k, pose in enumerate(self.poses):
+            if k != view and self.group[k] == self.group[view]:
+                J[k, :, k] = adjoint(T @ invert(self.poses[view]) @ pose)
+                J[k, :, view] = -adjoint(T)
+        flat = J.reshape(6 * count, 6 * count)
+        return (flat @ self.covariance @ flat.T).reshape(count, 6, count, 6)
 
     def clouds(self) -> Clouds:
         """Map the clouds of all views from their files."""
@@ -129,7 +139,7 @@ def put_together(
 def _joined(found: Sequence[Measured], rig: Rig, folder: Path) -> Surface:
     """Refine the poses of each turn of the object; what cannot be fused stays alone, with the reason."""
     poses = np.stack([m.T_base_stereo for m in found])
-    group, sigma = np.arange(len(found)), np.zeros((len(found), len(found)))
+    group, covariance = np.arange(len(found)), np.zeros((6 * len(found), 6 * len(found)))
     alone: dict[int, str] = {}
     planes, free = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("planes", "free"))
     for number, m in enumerate(found):
@@ -144,7 +154,8 @@ def _joined(found: Sequence[Measured], rig: Rig, folder: Path) -> Surface:
             continue
         samples = [found[k].samples for k in mine]
         done = register(samples, planes[mine], free[mine], rig.stereo, poses[mine])
-        sigma[np.ix_(mine, mine)] = spread(done, samples)
+        rows = (6 * np.array(mine)[:, None] + np.arange(6)).ravel()
+        covariance[np.ix_(rows, rows)] = done.covariance
         for place, k in enumerate(mine):
             together = int((done.group == done.group[place]).sum())
             if together == 1:
@@ -160,7 +171,7 @@ def _joined(found: Sequence[Measured], rig: Rig, folder: Path) -> Surface:
         if points:
             cloud = np.concatenate(points)
             bounds[number] = cloud.min(axis=0) - ABOUT, cloud.max(axis=0) + ABOUT
-    return Surface(folder, poses, group, sigma, bounds, alone)
+    return Surface(folder, poses, group, covariance, bounds, alone)
 
 
 def measure(path: Path, rig: Rig, reach: tuple[float, float], folder: Path, number: int) -> Measured:
@@ -224,12 +235,14 @@ def _cloud(sheet: Sheet, target: NDArray[np.bool_], rig: Rig) -> dict[str, NDArr
     depth = np.where(sheet.vertex, sheet.depth, np.nan)
     fitted, residual, share = PlaneField(depth, camera).cells()
     planes = np.empty((height, width, 5), dtype=np.float32)
+    alike = np.sqrt(alike_pixels(depth, fitted, residual, camera))
+    # Of noise that is alike in many pixels a plane takes more than three pixels' worth with it.
+    residual = residual / np.sqrt(max(1 - PLANE * (alike / (2 * max(RADII))) ** 2, 0.5))
     noise = float(np.nanmedian(residual)) if np.isfinite(residual).any() else 1e-3
     planes[..., :3] = fitted
     planes[..., 3] = np.where(np.isfinite(residual), residual, noise)
-    alike = np.sqrt(_correlated(depth, fitted, residual, camera))
-    # A window that is hardly wider than its noise averages more of it than the count says.
-    planes[..., 4] = residual * share * alike * np.maximum(1 - alike * share / np.pi, 0.5)
+    # A window that is hardly wider than its noise averages more of it than the count says; the numbers are the simulator's.
+    planes[..., 4] = residual * share * alike * np.maximum(1.08 - alike * share / np.pi, 0.54)
     planes[~sheet.vertex[at], 4] = np.nan
     z = np.nan_to_num(sheet.depth[: 2 * height, : 2 * width], nan=0.0).reshape(height, 2, width, 2)
     box = np.zeros(4, dtype=np.int64)
@@ -249,28 +262,6 @@ def _cloud(sheet: Sheet, target: NDArray[np.bool_], rig: Rig) -> dict[str, NDArr
         "free": minimum_filter(z.min(axis=(1, 3)), 3, mode="constant").astype(np.float32),
         "boxes": box,
     }
-
-
-def _correlated(depth: Float64, planes: Float64, residual: Float64, camera: Camera) -> float:
-    """Count the pixels whose noise is one: of noise that a Gaussian window correlates, from its correlation at a lag."""
-    height, width = residual.shape
-    flat = np.isfinite(residual)
-    products, squares = 0.0, 0.0
-    for rows in (slice(0, None, 8), slice(4, None, 8)):
-        rays = camera.rays[: 2 * height : 2, : 2 * width : 2][rows]
-        off = 1 / depth[: 2 * height : 2, : 2 * width : 2][rows] - np.einsum(
-            "hwc,hwc->hw", planes[rows], rays
-        )
-        off = np.where(flat[rows] & (np.abs(off) < 4 * residual[rows]), off, np.nan)
-        pair = off[:, 1:] * off[:, :-1]  # neighbours of cells are two pixels apart
-        products += float(np.nansum(pair))
-        squares += float(
-            np.nansum(np.where(np.isnan(pair), np.nan, (off[:, 1:] ** 2 + off[:, :-1] ** 2) / 2))
-        )
-    share = products / squares if squares > 0 else 0.0
-    if not 0 < share < 1:
-        return 1.0
-    return float(np.clip(-np.pi * CORRELATED_LAG**2 / np.log(share), 1.0, MOST))
 
 
 def _samples(planes: NDArray[np.float32], quads: NDArray[np.uint8], camera: Camera, seed: int) -> Samples:
@@ -326,8 +317,8 @@ def fused(
     window = np.s_[:, :] if len(members) == 1 else _window(surface, own, rig, camera)
     part = np.ascontiguousarray(rays[window].reshape(-1, 3))
     hits = Hits.none(len(T_tof_stereo), len(part))
+    off = surface.relative(own, rig.T_tof_stereo)
     for k in members.tolist():
-        floor = surface.pose_sigma[own, k]
         top, bottom, left, right = clouds.boxes[k].tolist()
         if k == own:
             z, place = seen.depth[window], seen.pixels[window] / 2
@@ -340,18 +331,18 @@ def fused(
             place = place + np.array([left, top])
         else:
             continue
-        meet(hits, k, z.ravel(), place.reshape(-1, 2), clouds, T_tof_stereo[k], part, floor)
+        meet(hits, k, z.ravel(), place.reshape(-1, 2), clouds, T_tof_stereo[k], part, off[k, :, k])
     near, clear = _entry(surface, own, rig, part), ~seen.occluded[window].ravel()
-    found = fuse(hits, members, own, clouds, T_tof_stereo, eye, part, near, clear)
+    found = fuse(hits, members, own, clouds, T_tof_stereo, eye, part, off, near, clear)
     shape = others[window].shape
     more = (np.isfinite(hits.depth).sum(axis=0) > np.isfinite(hits.depth[own])).reshape(shape)
     others[window] = more
     depth[window] = np.where(more, found.depth.reshape(shape), depth[window])
     normals[window] = np.where(more[..., None], found.normals.reshape(*shape, 3), normals[window])
     occluded[window] = np.where(more, found.occluded.reshape(shape), occluded[window])
-    doubtful[window] = more & found.doubtful.reshape(shape)
+    doubtful[window] = found.doubtful.reshape(shape)
     sigma[window], views[window] = found.sigma.reshape(shape), found.views.reshape(shape)
-    edge = np.where(others, edges(depth, camera, edge_pixels) | doubtful, seen.edge)
+    edge = np.where(others, edges(depth, camera, edge_pixels), seen.edge) | doubtful
     return Projection(depth, seen.pixels, normals, occluded, edge), sigma, views
 
 

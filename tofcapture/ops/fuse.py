@@ -25,12 +25,18 @@ GRAZING_COSINE = 0.25882  # cos 75 deg
 AGREE = 4.0  # standard deviations, and
 AGREE_M = 0.0004  # m; two surfaces further apart are two
 PAST = 0.003  # m; a view sees past a point that is so much nearer than what it saw
-FLOOR = 5e-6  # m; what planes leave out, and no average takes away
+FLOOR = 1.5e-6  # m; what planes leave out, and no average takes away
+LARGEST = (
+    0.45  # of a point's deviation: a plane that is less sure is of a small window; the surface may be bent
+)
+BENT = 0.3  # of such a plane's deviation, by which all views alike may miss a bent surface
+BEHIND = 0.004  # m; so near behind a surface more views must not hold another one for the first
+UNSURE = 0.0005  # m; a depth whose standard deviation is larger is doubtful
 STEP = 0.004  # m, between places on a ray that must be empty
 CLEAR = 0.005  # m; the last of them before the surface
 CHANCE = 2.0  # times its mean; so large the scatter of a few depths may be without being an error
 LEAST_SLOPE = 0.02  # metres along the normal for a metre of depth; surfaces that are seen more from their side are edges
-UNFLAT = 1.5  # times the noise, where no plane fits
+UNFLAT = 1.0  # times the noise, where no plane fits
 
 
 @dataclass(frozen=True)
@@ -54,13 +60,14 @@ class Hits:
 
     depth: Float32  #: (N, P) metres; NaN: nothing.
     sigma: Float32  #: (N, P) metres along the surface's normal; negative where it is not to be trusted.
+    noise: Float32  #: (N, P) metres, what of it is the view's own and not its pose's.
     cell: NDArray[np.int32]  #: (N, P) number of the cell of the view's plane.
 
     @staticmethod
     def none(views: int, pixels: int) -> Hits:
         """Return hits of nothing."""
         nothing = np.full((views, pixels), np.nan, dtype=np.float32)
-        return Hits(nothing, nothing.copy(), np.zeros((views, pixels), dtype=np.int32))
+        return Hits(nothing, nothing.copy(), nothing.copy(), np.zeros((views, pixels), dtype=np.int32))
 
 
 @dataclass(frozen=True)
@@ -73,22 +80,22 @@ class Fused:
     views: NDArray[
         np.int8
     ]  #: (P,) how many views it is made of; negative where the target's own is not among them.
-    doubtful: Bool  #: (P,) made of points that no view is sure of.
+    doubtful: Bool  #: (P,) made of points that no view is sure of, or held by fewer views than what is behind it, or refuted.
     occluded: Bool  #: (P,) the way there is not known to be empty.
 
 
 def meet(
     hits: Hits, view: int, depth: Float64, pixels: Float64, clouds: Clouds, T_target_stereo: Float64, rays: Float64,
-    floor: float,
+    off: Float64,
 ) -> None:  # fmt: skip
     """Put into ``hits`` what the target's rays (P, 3) meet of one view.
 
-    ``depth`` (P,) and ``pixels`` (P, 2), counted in cells, are what :func:`tofcapture.ops.project.place_hits` found. ``floor``, metres, is the
-    standard deviation of the view's surface through its pose.
+    ``depth`` (P,) and ``pixels`` (P, 2), counted in cells, are what :func:`tofcapture.ops.project.place_hits` found. ``off`` (6, 6) is the
+    covariance of the view's pose as a twist in the target's frame.
     """
     _meet(
-        depth, pixels, clouds.planes[view], clouds.quads[view], T_target_stereo, rays, floor,
-        hits.depth[view], hits.sigma[view], hits.cell[view],
+        depth, pixels, clouds.planes[view], clouds.quads[view], T_target_stereo, rays, off,
+        hits.depth[view], hits.sigma[view], hits.noise[view], hits.cell[view],
     )  # fmt: skip
 
 
@@ -100,13 +107,14 @@ def fuse(
     T_target_stereo: Float64,
     eye: Float64,
     rays: Float64,
+    off: Float64,
     near: Float64,
     clear: Bool,
 ) -> Fused:
     """Fuse the hits of the views that are members.
 
-    ``own`` is the target's own view, ``T_target_stereo`` (N, 4, 4), ``eye`` fx, fy, cx, cy of the stereo grid. Up to ``near``
-    (P,) metres deep there is nothing; the own view saw that there is nothing before its hit where it is ``clear`` (P,).
+    ``own`` is the target's own view, ``T_target_stereo`` (N, 4, 4), ``eye`` fx, fy, cx, cy of the stereo grid, ``off``
+    (N, 6, N, 6) the covariance of all views' poses as twists in the target's frame. Up to ``near`` (P,) metres deep there is nothing; the own view saw that there is nothing before its hit where it is ``clear`` (P,).
     """
     pixels = hits.depth.shape[1]
     out = Fused(
@@ -114,12 +122,12 @@ def fuse(
         np.full((pixels, 3), np.nan),
         np.full(pixels, np.nan),
         np.zeros(pixels, dtype=np.int8),
-        np.zeros(pixels, dtype=bool),
+        np.isfinite(hits.depth).any(axis=0),
         np.zeros(pixels, dtype=bool),
     )
     back = np.stack([_inverse(T) for T in T_target_stereo])
     _fuse(
-        hits.depth, hits.sigma, hits.cell, members, own, clouds.planes, clouds.free, T_target_stereo, back, eye, rays, near, clear,
+        hits.depth, hits.sigma, hits.noise, off, hits.cell, members, own, clouds.planes, clouds.free, T_target_stereo, back, eye, rays, near, clear,
         out.depth, out.normals, out.sigma, out.views, out.doubtful, out.occluded,
     )  # fmt: skip
     return out
@@ -133,12 +141,12 @@ def _inverse(T: Float64) -> Float64:
 
 @compiled
 def _meet(
-    depth: Float64, pixels: Float64, planes: Float32, quads: NDArray[np.uint8], pose: Float64, rays: Float64, floor: float,
-    out: Float32, sigma: Float32, cell: NDArray[np.int32],
+    depth: Float64, pixels: Float64, planes: Float32, quads: NDArray[np.uint8], pose: Float64, rays: Float64, off: Float64,
+    out: Float32, sigma: Float32, noise: Float32, cell: NDArray[np.int32],
 ) -> None:  # fmt: skip
     """Move hits onto the planes that fit about them, as those of one view alone are, and say how sure each is."""
     height, width = planes.shape[:2]
-    m = np.empty(3)
+    m, J = np.empty(3), np.empty(6)
     for i in range(len(depth)):
         z = depth[i]
         if not z > 0:
@@ -157,7 +165,7 @@ def _meet(
             distance += offset * offset
         cell[i], out[i] = row * width + column, z
         if not along > 0:
-            sigma[i] = -1e-3
+            sigma[i], noise[i] = -1e-3, 1e-3
             continue
         error = own_z * plane[3] / size  # of one point, along the normal
         there = (1 + m[0] * pose[0, 3] + m[1] * pose[1, 3] + m[2] * pose[2, 3]) / along
@@ -169,7 +177,29 @@ def _meet(
             quads[min(int(v), height - 2), min(int(u), width - 2)] & INNER
             and 1 / (size * np.sqrt(distance)) > GRAZING_COSINE
         )
-        sigma[i] = np.sqrt(error * error + floor * floor) * (1.0 if trusted else -1.0)
+        _lever(rays[i], out[i], m[0] / size, m[1] / size, m[2] / size, J)
+        sigma[i] = np.sqrt(error * error + _product(J, off)) * (1.0 if trusted else -1.0)
+        noise[i] = error
+
+
+@compiled
+def _lever(ray: Float64, z: float, a: float, b: float, c: float, out: Float64) -> None:
+    """Write into ``out`` (6,) how a twist moves a surface of normal (a, b, c) along it, at depth z on a ray (3,)."""
+    x, y, w = z * ray[0], z * ray[1], z * ray[2]
+    out[0], out[1], out[2] = a, b, c
+    out[3], out[4], out[5] = y * c - w * b, w * a - x * c, x * b - y * a
+
+
+@compiled
+def _product(J: Float64, off: Float64) -> float:
+    """Return ``J off J`` for J (6,) and off (6, 6)."""
+    total = 0.0
+    for a in range(6):
+        row = 0.0
+        for b in range(6):
+            row += off[a, b] * J[b]
+        total += J[a] * row
+    return total
 
 
 @compiled
@@ -188,15 +218,16 @@ def _empty(free: Float32, back: Float64, eye: Float64, x: float, y: float, z: fl
 
 @compiled
 def _fuse(
-    depth: Float32, sigma: Float32, cell: NDArray[np.int32], members_of: NDArray[np.intp], own: int, planes: Float32, free: Float32,
+    depth: Float32, sigma: Float32, noise: Float32, off: Float64, cell: NDArray[np.int32], members_of: NDArray[np.intp], own: int, planes: Float32, free: Float32,
     poses: Float64, backs: Float64, eye: Float64, rays: Float64, near: Float64, clear: Bool,
     out: Float64, normals: Float64, deviation: Float64, views: NDArray[np.int8], doubtful: Bool, occluded: Bool,
 ) -> None:  # fmt: skip
     """Fuse the hits (N, P) of all pixels; see :func:`fuse`."""
     count, pixels = depth.shape
     width = planes.shape[2]
-    order, member, slope = np.empty(count, np.int64), np.empty(count, np.bool_), np.empty(count)
-    m = np.empty(3)
+    order, kept, member = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.bool_)
+    slope, weight = np.empty(count), np.empty(count)
+    m, J = np.empty(3), np.empty(6)
     for i in range(pixels):
         found = 0
         for j in range(count):
@@ -222,43 +253,55 @@ def _fuse(
             slope[j] = max(along / size, LEAST_SLOPE)
         for first in range(found):
             begin = order[first]
-            members, sure = 0, 0
+            members, sure, behind = 0, 0, 0
             for a in range(found):
                 j = order[a]
-                apart = abs(depth[j, i] - depth[begin, i]) * min(slope[j], slope[begin])
+                # The flatter look at it decides: along a wall that is seen from its side, depths say little.
+                apart = abs(depth[j, i] - depth[begin, i]) * max(slope[j], slope[begin])
                 member[j] = apart < AGREE * np.sqrt(sigma[j, i] ** 2 + sigma[begin, i] ** 2) + AGREE_M
                 members += member[j]
                 sure += member[j] and sigma[j, i] > 0
+                behind += not member[j] and sigma[j, i] > 0 and 0 < depth[j, i] - depth[begin, i] < BEHIND
             z = float(depth[begin, i])
             past = 0
             for j in members_of[: 0 if 2 * members >= len(members_of) else len(members_of)]:
                 past += _empty(free[j], backs[j], eye, z * x, z * y, z * w, PAST)
             if past > members:
                 continue
-            _average(depth[:, i], sigma[:, i], order[:found], member, slope, sure > 0, i, out, deviation)
-            # The normal of the planes that the depth is made of.
-            m[:] = 0
-            views[i], has_own = 0, False
+            used = 0
             for a in range(found):
                 j = order[a]
                 if member[j] and (sigma[j, i] > 0 or not sure):
-                    views[i] += 1
-                    has_own |= j == own
-                    plane, pose = planes[j, cell[j, i] // width, cell[j, i] % width], poses[j]
-                    size = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
-                    weight = 1 / (size * sigma[j, i] ** 2)
-                    if slope[j] > LEAST_SLOPE:  # those that face away say nothing
-                        for k in range(3):
-                            m[k] -= weight * (
-                                pose[k, 0] * plane[0] + pose[k, 1] * plane[1] + pose[k, 2] * plane[2]
-                            )
+                    kept[used] = j
+                    used += 1
+            out[i], left, beyond = _average(depth[:, i], sigma[:, i], noise[:, i], kept[:used], slope, weight)
+            # The normal of the planes that the depth is made of.
+            m[:] = 0
+            views[i], has_own, bent = 0, False, 0.0
+            for j in kept[:used]:
+                views[i] += 1
+                has_own |= j == own
+                plane, pose = planes[j, cell[j, i] // width, cell[j, i] % width], poses[j]
+                if plane[4] > LARGEST * plane[3]:
+                    bent += weight[j] * BENT * noise[j, i]
+                size = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
+                share = 1 / (size * sigma[j, i] ** 2)
+                if slope[j] > LEAST_SLOPE:  # those that face away say nothing
+                    for k in range(3):
+                        m[k] -= share * (
+                            pose[k, 0] * plane[0] + pose[k, 1] * plane[1] + pose[k, 2] * plane[2]
+                        )
             size = np.sqrt(m[0] ** 2 + m[1] ** 2 + m[2] ** 2)
             if size == 0:
                 m[0], m[1], m[2], size = -x, -y, -w, np.sqrt(x * x + y * y + w * w)
             for k in range(3):
                 normals[i, k] = m[k] / size
+            steepest = max(-normals[i, 0] * x - normals[i, 1] * y - normals[i, 2] * w, LEAST_SLOPE)
+            _lever(rays[i], out[i], normals[i, 0], normals[i, 1], normals[i, 2], J)
+            off_normal = _unplaced(J, off, kept[:used], weight) + FLOOR**2 + bent**2
+            deviation[i] = np.sqrt(beyond * left + beyond * off_normal / steepest**2)
             views[i] = views[i] if has_own else -views[i]
-            doubtful[i] = sure == 0
+            doubtful[i] = sure == 0 or behind > sure or deviation[i] > UNSURE
             last, z = own, out[i] - CLEAR
             while z > near[i] and not (has_own and clear[i]):
                 empty = _empty(free[last], backs[last], eye, z * x, z * y, z * w, 0.0)
@@ -277,31 +320,44 @@ def _fuse(
 
 @compiled
 def _average(
-    depth: Float32, sigma: Float32, order: NDArray[np.int64], member: Bool, slope: Float64, sure: bool, pixel: int,
-    out: Float64, deviation: Float64,
-) -> None:  # fmt: skip
-    """Average the members' depths by their noise; one that is far from the others counts less."""
-    mean, error = 0.0, 0.0
+    depth: Float32, sigma: Float32, noise: Float32, kept: NDArray[np.int64], slope: Float64, weight: Float64
+) -> tuple[float, float, float]:
+    """Average the depths of the views that are ``kept`` by their errors; one that is far from the others counts less.
+
+    Writes each one's ``weight`` (N,). Returns the mean, the variance that noise leaves it, m^2, and by how much the variance is
+    to be multiplied, as the depths scatter more than errors may leave.
+    """
+    mean, beyond, left = 0.0, 1.0, 0.0
     for turn in range(3):
-        total, weights, squares, count = 0.0, 0.0, 0.0, 0
-        for j in order:
-            if member[j] and (sigma[j] > 0 or not sure):
-                s = sigma[j] / slope[j]  # along the ray
-                weight = 1 / (s * s)
-                off = (depth[j] - mean) / s
-                if turn:
-                    weight /= max(1.0, abs(off) / 2)
-                total += weight * depth[j]
-                weights += weight
-                squares += weight * off * off * s * s
-                count += 1
+        total, weights, squares, left = 0.0, 0.0, 0.0, 0.0
+        for j in kept:
+            s, apart = sigma[j] / slope[j], depth[j] - mean  # along the ray
+            weight[j] = 1 / (s * s)
+            if turn:
+                weight[j] /= max(1.0, abs(apart / s) / 2)
+            total += weight[j] * depth[j]
+            weights += weight[j]
+            squares += weight[j] * apart * apart
+            left += (weight[j] * noise[j] / slope[j]) ** 2
         mean = total / weights
-        error = 1 / weights
-        if turn and count > 1:  # scatter beyond what noise may leave is error too
-            error *= max(1.0, squares / (count - 1) / CHANCE)
-    steepest = 1.0
-    for j in order:
-        if member[j]:
-            steepest = min(steepest, slope[j])
-    out[pixel] = mean
-    deviation[pixel] = np.sqrt(error + (FLOOR / steepest) ** 2)
+        for j in kept:
+            weight[j] /= weights
+        left /= weights * weights
+        if turn and len(kept) > 1:
+            beyond = max(1.0, squares / (len(kept) - 1) / CHANCE)
+    return mean, left, beyond
+
+
+@compiled
+def _unplaced(J: Float64, off: Float64, kept: NDArray[np.int64], weight: Float64) -> float:
+    """Return the variance, m^2, along a normal of the mean surface through the poses of the views that are ``kept``.
+
+    ``J`` (6,) is the normal's, ``off`` (N, 6, N, 6); what is off in all views alike stays in the mean.
+    """
+    total = 0.0
+    for a in range(len(kept)):
+        j = kept[a]
+        total += weight[j] ** 2 * _product(J, off[j, :, j])
+        for k in kept[:a]:
+            total += 2 * weight[j] * weight[k] * _product(J, off[j, :, k])
+    return max(total, 0.0)

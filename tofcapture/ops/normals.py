@@ -28,6 +28,8 @@ GRID = 16  # pixels between the places where noise is estimated
 ABOUT = 2  # such places on every side that tell the noise of one
 QUIET = 30.0  # percentile of their residuals that is noise: edges are in fewer
 CELL = 2  # pixels: windows start and end at cells, a quarter of the table's memory and of its cache misses
+LAG = 2  # pixels, at which the noise's correlation is measured
+MOST = 1000.0  # pixels whose noise is one
 _MIN_SPREAD = 1e-4  # det / trace^2 of the window's rays; below, they are a line and the plane may swivel
 
 
@@ -110,7 +112,7 @@ class PlaneField:
 
         Returns (h, w, 3) planes as :meth:`at` does; (h, w) the standard deviation of a point's inverse depth, which no
         curvature is part of, NaN where no window is flat; and (h, w) that of the plane in the middle, as a share of it, were the
-        noise of no two pixels alike.
+        noise of no two pixels alike, NaN where the smallest window alone is flat: how far it misses a bent surface nobody knows.
         """
         width, height = self._camera.width // CELL, self._camera.height // CELL
         u, v = np.meshgrid(np.arange(width), np.arange(height))
@@ -179,6 +181,31 @@ class PlaneField:
         hits = depth.reshape(-1), normals.reshape(-1, 3)
         _onto(planes, residuals, T_camera_own, camera.rays.reshape(-1, 3), WITHIN, *hits)
         return depth, normals
+
+
+def alike_pixels(depth: Float64, planes: Float64, residual: Float64, camera: Camera) -> float:
+    """Count the pixels whose noise is one: of noise that a Gaussian window correlates, from its correlation at a lag.
+
+    ``planes`` (h, w, 3) and ``residual`` (h, w) are those of :meth:`PlaneField.cells` of ``depth`` (H, W), metres.
+    """
+    height, width = residual.shape
+    flat = np.isfinite(residual)
+    products, squares = 0.0, 0.0
+    for rows in (slice(0, None, 8), slice(4, None, 8)):
+        rays = camera.rays[: 2 * height : 2, : 2 * width : 2][rows]
+        off = 1 / depth[: 2 * height : 2, : 2 * width : 2][rows] - np.einsum(
+            "hwc,hwc->hw", planes[rows], rays
+        )
+        off = np.where(flat[rows] & (np.abs(off) < 4 * residual[rows]), off, np.nan)
+        pair = off[:, 1:] * off[:, :-1]  # neighbours of cells are two pixels apart
+        products += float(np.nansum(pair))
+        squares += float(
+            np.nansum(np.where(np.isnan(pair), np.nan, (off[:, 1:] ** 2 + off[:, :-1] ** 2) / 2))
+        )
+    share = products / squares if squares > 0 else 0.0
+    if not 0 < share < 1:
+        return 1.0
+    return float(np.clip(-np.pi * LAG**2 / np.log(share), 1.0, MOST))
 
 
 @compiled
@@ -268,8 +295,8 @@ def _choose(
 
     A plane through a bent surface misses its middle by an amount that grows with the square of the window; two windows tell
     it, and the plane is moved to where it vanishes. ``rays`` (n, 2) are x and y at the pixels. ``residual`` (n,) is that of
-    a plane within the limits, NaN otherwise; ``own`` (n,) times that is the noise of what was chosen. Pixels (n, 2) of NaN get
-    NaN.
+    a plane within the limits, NaN otherwise; ``own`` (n,) times that is the noise of what was chosen, NaN where nothing tells how
+    bent the surface is. Pixels (n, 2) of NaN get NaN.
     """
     window, large, small = np.empty(10), np.empty(3), np.empty(3)
     for i in range(len(pixels)):
@@ -283,7 +310,7 @@ def _choose(
                 chosen[i, :] = large
             if not left <= limits[j] * noisier[i]:
                 continue
-            residual[i], own[i], count = left, 1 / np.sqrt(window[0]), window[0]
+            residual[i], count = left, window[0]
             if j > 0 and np.isfinite(_fit_window(sums, u, v, radii[j - 1], min_spread, window, small)):
                 there = large[0] * rays[i, 0] + large[1] * rays[i, 1] + large[2]
                 inner = small[0] * rays[i, 0] + small[1] * rays[i, 1] + small[2]

@@ -34,7 +34,10 @@ GATES = (
 COMMON = np.repeat(
     [0.003, 0.005], 3
 )  # m, rad; standard deviations of a hand-eye transform that is badly known
-OWN = np.repeat([0.0005, 0.0008], 3)  # the same of one pose of an arm
+OWN = 0.0005, 0.0008  # the same of one pose of a bad arm; a better one shows by how little its poses move
+SURE = 2e-5, 2e-5  # the same of the best arm
+OUTLYING = 3.0  # times the usual: a pose that is so far off is no arm's error
+SETTLED = 4  # gates, after which the poses tell how good the arm is
 LEAST = 5e-5  # m; no plane is surer
 FACING = 0.7  # cosine; two planes that are one surface have normals at most this far apart
 MANY = 10.0  # sampled planes of a view share so many of their points, and the windows' errors
@@ -75,7 +78,8 @@ def register(
     """
     start, poses, count = poses, poses.copy(), len(poses)
     eye = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    for gate in GATES:
+    own = np.array(OWN)
+    for turn, gate in enumerate(GATES):
         A, b = np.zeros((6 * count + 6, 6 * count + 6)), np.zeros(6 * count + 6)
         for i, j in ((i, j) for i in range(count) for j in range(count) if i != j):
             s = samples[i]
@@ -86,37 +90,35 @@ def register(
             at = np.r_[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
             A[np.ix_(at, at)] += part / MANY
             b[at] += right / MANY
-        _hold(A, b, np.stack([log(invert(t) @ p) for t, p in zip(start, poses, strict=True)]))
-        step = np.linalg.solve(A, b)[: 6 * count].reshape(count, 6)
-        poses = np.asarray([p @ exp(x) for p, x in zip(poses, step, strict=True)], dtype=np.float64)
-    covariance = np.asarray(np.linalg.inv(A)[: 6 * count, : 6 * count], dtype=np.float64)
+        moved = np.stack([log(invert(t) @ p) for t, p in zip(start, poses, strict=True)])
+        _hold(A, b, moved, np.repeat(own, 3))
+        covariance, step = np.linalg.inv(A), np.linalg.solve(A, b).reshape(count + 1, 6)
+        poses = np.asarray([p @ exp(x) for p, x in zip(poses, step[:-1], strict=True)], dtype=np.float64)
+        if turn >= SETTLED:
+            own = _repeats(moved + step[:-1] - step[-1], covariance)
+    covariance = np.ascontiguousarray(covariance[: 6 * count, : 6 * count])
     agreeing = _agreement(samples, planes, free, eye, poses)
     return Registration(poses, covariance, _groups(agreeing), agreeing)
 
 
-def spread(done: Registration, samples: Sequence[Samples]) -> Float64:
-    """Tell how far, as one standard deviation in metres, the surface of view j is off view i's through both poses: (N, N)."""
-    out = np.zeros((len(samples), len(samples)))
-    for j, s in enumerate(samples):
-        some = s.target if s.target.any() else slice(None)
-        p, n = s.points[some], s.normals[some]
-        J = np.concatenate([n, np.cross(p, n)], axis=1)
-        of_j = slice(6 * j, 6 * j + 6)
-        for i in range(len(samples)):
-            if i == j:
-                continue
-            T = invert(done.poses[i]) @ done.poses[j]
-            moved, turned = p @ T[:3, :3].T + T[:3, 3], n @ T[:3, :3].T
-            K = np.concatenate([J, -turned, -np.cross(moved, turned)], axis=1)
-            at = np.r_[of_j, 6 * i : 6 * i + 6]
-            variance = np.einsum("ma,ab,mb->m", K, done.covariance[np.ix_(at, at)], K)
-            out[i, j] = np.sqrt(np.median(np.maximum(variance, 0.0)))
-    return out
+def _repeats(off: Float64, covariance: Float64) -> Float64:
+    """Estimate how well the arm repeats, m and rad, from what its poses (N, 6) are off, and from how well that is known.
+
+    One step of expectation and maximisation a call; poses that are wrong altogether do not count.
+    """
+    count = len(off)
+    blocks = covariance.reshape(count + 1, 6, count + 1, 6)
+    each = np.einsum("iaia->ia", blocks[:-1, :, :-1])
+    shared = np.einsum("iaa->ia", blocks[:-1, :, -1])
+    variance = off**2 + each - 2 * shared + np.diagonal(blocks[-1, :, -1])
+    squares = variance.reshape(count, 2, 3).mean(axis=2)
+    usual = squares <= OUTLYING**2 * np.median(squares, axis=0)
+    return np.asarray(np.clip(np.sqrt((squares * usual).sum(axis=0) / usual.sum(axis=0)), SURE, OWN))
 
 
-def _hold(A: Float64, b: Float64, moved: Float64) -> None:
-    """Add what is known of the poses: ``moved`` (N, 6) from where they began, a common part and each one's own."""
-    own, common = 1 / OWN**2, len(b) - 6
+def _hold(A: Float64, b: Float64, moved: Float64, sigma: Float64) -> None:
+    """Add what is known of the poses: ``moved`` (N, 6) from where they began, a common part and each one's own, ``sigma`` (6,)."""
+    own, common = 1 / sigma**2, len(b) - 6
     for i, xi in enumerate(moved):
         for k in range(6):
             at, c = 6 * i + k, common + k
