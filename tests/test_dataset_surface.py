@@ -19,6 +19,7 @@ from tofcapture.files.layout import MaskBit
 from tofcapture.files.shard import ShardReader
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, View
+from tofcapture.ops.register import OWN, _repeats
 from tofcapture.poses import exp, invert, look_at
 from tofcapture.rig import dumps_rig
 
@@ -130,6 +131,15 @@ def test_all_views_see_more_than_one(views, fused, single):
     assert np.percentile(added, 99) < 0.002
     assert max(before.max(), added.max()) < 0.005
     assert 0.5 < (sure < 1).mean() < 0.95
+
+
+def test_poses_tell_how_well_the_arm_repeats():
+    """One that is wrong altogether does not count, and nothing is made of poses that nobody could tell apart."""
+    rng, covariance = np.random.default_rng(0), np.zeros((41 * 6, 41 * 6))
+    off = rng.standard_normal((40, 6)) * np.repeat([1e-4, 2e-4], 3)
+    off[3] = 0.04
+    np.testing.assert_allclose(_repeats(off, covariance), [1e-4, 2e-4], rtol=0.2)
+    np.testing.assert_allclose(_repeats(0 * off, covariance + np.eye(len(covariance))), OWN)
 
 
 @pytest.mark.slow

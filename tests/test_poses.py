@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from tofcapture.errors import ConfigError
 from tofcapture.poses import (
+    adjoint,
     check_transform,
     exp,
     invert,
@@ -34,10 +35,12 @@ def test_exp_and_log_undo_each_other(seed, scale):
 @given(st.integers(0, 10_000))
 @settings(max_examples=30)
 def test_group_axioms(seed):
-    """Products stay rigid, the inverse undoes, composition associates with point maps."""
+    """Products stay rigid, the inverse undoes, composition associates with point maps, twists change frames."""
     rng = np.random.default_rng(seed)
     A, B = (exp(rng.standard_normal(6)) for _ in range(2))
     check_transform(A @ B)
+    xi = rng.standard_normal(6)
+    np.testing.assert_allclose(A @ exp(xi), exp(adjoint(A) @ xi) @ A, atol=1e-9)
     np.testing.assert_allclose(invert(A) @ A, np.eye(4), atol=1e-12)
     p = rng.standard_normal((5, 3))
     np.testing.assert_allclose(

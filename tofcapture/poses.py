@@ -145,7 +145,8 @@ def exp(xi: ArrayLike) -> Float64:
 
 def adjoint(T: Float64) -> Float64:
     """Return (6, 6) what takes twists (6,) of a frame to that which ``T`` maps it to: ``T exp(xi) = exp(adjoint(T) xi) T``."""
-    out = np.kron(np.eye(2), T[:3, :3])
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = T[:3, :3]
     out[:3, 3:] = hat(T[:3, 3]) @ T[:3, :3]
     return out
 

@@ -122,7 +122,7 @@ def fuse(
         np.full((pixels, 3), np.nan),
         np.full(pixels, np.nan),
         np.zeros(pixels, dtype=np.int8),
-        np.isfinite(hits.depth).any(axis=0),
+        np.asarray(np.isfinite(hits.depth).any(axis=0)),
         np.zeros(pixels, dtype=bool),
     )
     back = np.stack([_inverse(T) for T in T_target_stereo])

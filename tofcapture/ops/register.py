@@ -92,7 +92,8 @@ def register(
             b[at] += right / MANY
         moved = np.stack([log(invert(t) @ p) for t, p in zip(start, poses, strict=True)])
         _hold(A, b, moved, np.repeat(own, 3))
-        covariance, step = np.linalg.inv(A), np.linalg.solve(A, b).reshape(count + 1, 6)
+        covariance = np.asarray(np.linalg.inv(A), dtype=np.float64)
+        step = np.linalg.solve(A, b).reshape(count + 1, 6)
         poses = np.asarray([p @ exp(x) for p, x in zip(poses, step[:-1], strict=True)], dtype=np.float64)
         if turn >= SETTLED:
             own = _repeats(moved + step[:-1] - step[-1], covariance)
