@@ -6,6 +6,8 @@ seed draws everything that may differ from one station to another: the rig itsel
 the drawing's error, the surroundings that throw light back, and the poses. Seeds share nothing but the board, the lenses and the
 lamp. Light and noise-free depth are rendered once into the cache, about half a minute of CPU a seed.
 
+``--method targetless`` aligns by two scenes of the table, six views each, instead, from the drawing.
+
 ``--pool`` names an independent set of stations. Pool 1 was looked at while the method was made; figures come from others.
 """
 
@@ -15,6 +17,8 @@ import argparse
 import json
 import tempfile
 import time
+from dataclasses import replace
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +28,7 @@ from numpy.typing import NDArray
 from calibration.alignment.averages import about, average_transforms, fuse, twist_about
 from calibration.alignment.joint import joint_icp
 from calibration.alignment.methods import alignment_error
+from calibration.alignment.targetless import align_scenes
 from calibration.alignment.views import joint_view_of
 from calibration.registration.clouds import WORKING_DEPTH, Cloud, tof_depth
 from calibration.registration.gate import register
@@ -31,14 +36,17 @@ from calibration.registration.pairs import sighting_of
 from tofcapture.devices.sim import stereo as stereos
 from tofcapture.devices.sim.config import Constants, read_constants
 from tofcapture.devices.sim.light import Light
-from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, scene_objects
+from tofcapture.devices.sim.scenes import BOARD_CENTRE, BOARD_TILT, TABLE_CENTRE, scene_objects
 from tofcapture.devices.sim.sensor import expose
 from tofcapture.devices.sim.stereo import point_map
 from tofcapture.devices.sim.world import SimWorld
+from tofcapture.files.view import write_view
 from tofcapture.frames import ArmState, StereoFrame, TofBurst, Truth, View
-from tofcapture.poses import Float64, invert, look_at, rotation_exp, transform_points
+from tofcapture.poses import Float64, exp, invert, look_at, rotation_exp, transform_points
 
 VIEWS = 12
+SCENES, OBJECTS = 2, 3  # without a board; objects at least
+ARM = np.repeat([0.02e-3, np.radians(0.001)], 3)  # m, rad: how well an arm repeats
 RIG_SPREAD = (0.006, 0.012)  # m, rad: how far the seeds' rigs differ in each component
 FRAMES = 10
 LAMP = {"lamp": {"half_angle": 0.70, "edge": 0.17}}  # of the embedded station
@@ -168,12 +176,61 @@ def run_seed(pool: int, seed: int, cache: Path) -> list[dict[str, Any]]:
     rows = [_row("plain averaged", averaged, true), _row("plain weighted", weighted, true)]
     joint = joint_icp(reduced, start)
     row = _row("joint", joint.T_tof_stereo, true)
-    error = twist_about(joint.T_tof_stereo @ invert(true), joint.centre)
-    row["covered"] = (np.abs(error) < np.sqrt(np.diag(joint.covariance))).tolist()
-    row["standardised"] = (error / np.sqrt(np.diag(joint.covariance))).tolist()
-    row["error"] = error.tolist()
-    row["sigma"] = np.sqrt(np.diag(joint.covariance)).tolist()
-    return [*rows, row]
+    return [*rows, row | _judged(joint.T_tof_stereo, true, joint.centre, joint.covariance)]
+
+
+def scenes_of(pool: int, seed: int) -> list[str]:
+    """Name two scenes of at least three objects."""
+    own, first = 1000 * pool + seed, int(np.random.default_rng([pool, seed, 11]).integers(0, 1000))
+    names = (f"random-{n}" for n in count(first + 1))
+    return list(islice((n for n in names if sum(o.target for o in scene_objects(n, own)) >= OBJECTS), SCENES))
+
+
+def scene_poses(pool: int, seed: int, scene: int) -> list[Float64]:
+    """``T_base_tof`` of a scene's views: 15 to 55 degrees off the vertical, all round, 0.45 to 0.95 m away."""
+    rng = np.random.default_rng([pool, seed, 13, scene])
+    each = VIEWS // SCENES
+    order, start = rng.permutation(each), rng.uniform(0, 2 * np.pi)
+    out = []
+    for i in range(each):
+        tilt, turn = np.radians(rng.uniform(15, 55)), start + 2.399963 * i
+        direction = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
+        away = 0.45 + 0.5 * (order[i] + rng.uniform()) / each
+        target = TABLE_CENTRE + [0, 0, 0.05] + rng.uniform(-0.08, 0.08, 3)  # noqa: RUF005  a sum
+        up, roll = [1.0, 0.0, 0.0], rng.uniform(-0.5, 0.5)
+        out.append(look_at(target + away * direction, target, up=up, roll=roll))
+    return out
+
+
+def run_scenes(pool: int, seed: int, cache: Path) -> list[dict[str, Any]]:
+    """Align one seed by scenes without a board, from the drawing; the arm says its poses as it repeats them."""
+    world, rng = world_of(pool, seed), np.random.default_rng([pool, seed, 23])
+    true, rig = world.true_rig, world.nominal_rig()
+    with tempfile.TemporaryDirectory() as files:
+        scenes = []
+        for k, name in enumerate(scenes_of(pool, seed)):
+            world.place(name)
+            folder = cache / f"{pool}-{seed}-{name}"
+            folder.mkdir(parents=True, exist_ok=True)
+            scenes.append([Path(files) / f"{name}-{i}.h5" for i in range(VIEWS // SCENES)])
+            for i, (path, pose) in enumerate(zip(scenes[-1], scene_poses(pool, seed, k), strict=True)):
+                view = view_of(world, *render(world, pose, folder / f"pose-{i:03d}.npz"), 100 * k + i)
+                said = pose @ invert(true.T_flange_tof) @ exp(ARM * rng.standard_normal(6))
+                arm = ArmState(np.zeros(6), said, 0)
+                write_view(path, replace(view, scene=name, index=i, arm_before=arm, arm_after=arm))
+        found = align_scenes(scenes, rig)
+    row = _row("targetless", found.T_tof_stereo, true.T_tof_stereo)
+    return [row | _judged(found.T_tof_stereo, true.T_tof_stereo, found.centre, found.covariance)]
+
+
+def _judged(T: Float64, true: Float64, centre: Float64, covariance: Float64) -> dict[str, Any]:
+    error, sigma = twist_about(T @ invert(true), centre), np.sqrt(np.diag(covariance))
+    return {
+        "covered": (np.abs(error) < sigma).tolist(),
+        "standardised": (error / sigma).tolist(),
+        "error": error.tolist(),
+        "sigma": sigma.tolist(),
+    }
 
 
 def _row(method: str, T_tof_stereo: Float64, true: Float64) -> dict[str, Any]:
@@ -190,7 +247,7 @@ def summary(rows: list[dict[str, Any]]) -> str:
     lines = [
         f"{'method':16}{'median deg':>11}{'median mm':>11}{'max deg':>9}{'max mm':>8}  better than plain"
     ]
-    plain = [r for r in rows if r["method"] == "plain averaged"]
+    plain = [r for r in rows if r["method"] == "plain averaged"] or rows
     base = [float(np.median([r[k] for r in plain])) for k in ("rotation_deg", "translation_mm")]
     for method in dict.fromkeys(r["method"] for r in rows):
         own = [r for r in rows if r["method"] == method]
@@ -201,7 +258,9 @@ def summary(rows: list[dict[str, Any]]) -> str:
         )
     covered = np.array([r["covered"] for r in rows if "covered" in r])
     share = 100 * covered.mean()
-    lines.append(f"joint: 1-sigma covers {covered.sum()} of {covered.size} seed-components, {share:.1f} %")
+    lines.append(
+        f"{rows[-1]['method']}: 1-sigma covers {covered.sum()} of {covered.size} seed-components, {share:.1f} %"
+    )
     each = ", ".join(f"{c:.0f}" for c in 100 * covered.mean(axis=0))
     lines.append(f"  by component (x y z, rx ry rz), %: {each}")
     twice = np.abs([r["standardised"] for r in rows if "standardised" in r]) < 2
@@ -223,14 +282,18 @@ def main() -> None:
     parser.add_argument(
         "--cache", type=Path, default=Path(tempfile.gettempdir()) / "tofcapture-alignment-seeds"
     )
+    parser.add_argument("--method", choices=("board", "targetless"), default="board")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
+    run = run_scenes if args.method == "targetless" else run_seed
     rows: list[dict[str, Any]] = []
     began = time.monotonic()
     for seed in range(args.first, args.first + args.seeds):
-        rows += [{"seed": seed, **row} for row in run_seed(args.pool, seed, args.cache)]
+        rows += [{"seed": seed, **row} for row in run(args.pool, seed, args.cache)]
         told = "  ".join(
-            f"{r['method']} {r['rotation_deg']:.3f} deg {r['translation_mm']:.2f} mm" for r in rows[-3:]
+            f"{r['method']} {r['rotation_deg']:.3f} deg {r['translation_mm']:.2f} mm"
+            for r in rows
+            if r["seed"] == seed
         )
         print(f"seed {seed}: {told}  ({time.monotonic() - began:.0f} s)", flush=True)
         if args.out:

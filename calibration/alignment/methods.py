@@ -22,7 +22,7 @@ from tofcapture.errors import ConfigError
 from tofcapture.poses import Float64, invert, rotation_angle, transform_points
 from tofcapture.rig import RangeError, Rig, range_error_table
 
-METHODS = ("averaged", "weighted", "joint")
+METHODS = ("averaged", "weighted", "joint", "targetless")
 TRUTH_POINT = (0.0, 0.0, 0.8)  # m, ToF frame: the middle of the working volume, where errors are stated
 
 MOTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
@@ -53,7 +53,7 @@ def apply_method(
     found, rig = {"averaged": averaged, "weighted": weighted}, start
     extra: dict[str, Any] = {}
     if method == "weighted":
-        extra = _uncertainty(*_left_out(solution, weighted))
+        extra = uncertainty_of(*_left_out(solution, weighted))
     if method == "joint":
         used = [view for i in solution.used if (view := views[i])]
         joint = joint_icp(used, averaged)
@@ -99,7 +99,7 @@ def joint_evidence(joint: JointSolution, modulation_hz: Sequence[float]) -> dict
     values, _ = observability(information)
     return {
         "working_point_m": joint.centre.tolist(),
-        **_uncertainty(joint.influence, joint.covariance),
+        **uncertainty_of(joint.influence, joint.covariance),
         "observability": {
             "eigenvalues": values.tolist(),
             "sigma_mm": _sigma_mm(values).tolist(),
@@ -181,7 +181,7 @@ def _sigma_mm(eigenvalues: Float64) -> Float64:
     return np.asarray(1e3 / np.sqrt(np.maximum(eigenvalues, 1e-12)))
 
 
-def _uncertainty(influence: Float64, covariance: Float64) -> dict[str, Any]:
+def uncertainty_of(influence: Float64, covariance: Float64) -> dict[str, Any]:
     """Covariance (6, 6) about the working point and what it means, as JSON types; ``influence`` as of :func:`jackknife`."""
     sigma = np.sqrt(np.diag(covariance))
     moved = ", ".join(f"{1e3 * s:.2f} mm along {a}" for a, s in zip("xyz", sigma[:3], strict=True))

@@ -31,9 +31,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         default="averaged",
-        choices=("averaged", "weighted", "joint"),
+        choices=("averaged", "weighted", "joint", "targetless"),
         metavar="METHOD",
-        help="averaged as in the paper, weighted by information, or joint with range errors (default: averaged)",
+        help="averaged as in the paper, weighted by information, joint with range errors, or targetless by scenes (default: averaged)",
     )
     parser.add_argument(
         "--initial",
@@ -86,6 +86,9 @@ def _page(
     """Write evidence.html; its path, or None and why there is none: rig and evidence stand without it."""
     from calibration.evidence.page import write_evidence_page
 
+    if evidence.get("method") == "targetless":
+        (out / "evidence.html").unlink(missing_ok=True)
+        return None, "no evidence.html: it shows views of the board; evidence.json has all"
     try:
         return str(write_evidence_page(recording, old, evidence, progress, out)), ""
     except ConfigError as err:

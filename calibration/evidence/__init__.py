@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from calibration.alignment.methods import alignment_error
+from calibration.alignment.methods import alignment_error, uncertainty_of
 from calibration.alignment.rounds import Solution
+from calibration.alignment.targetless import TargetlessSolution
 from calibration.limits import LIMITS, SIGNIFICANT, Judged, judged, worst
 from calibration.registration.pairs import Pair
 from tofcapture.errors import DataError
@@ -63,6 +64,48 @@ def evidence_of(
         },
         **found,
     }
+    return _with_verdict(evidence)
+
+
+def evidence_of_scenes(
+    inputs: Mapping[str, str], solution: TargetlessSolution, initial: Float64, true: Float64 | None
+) -> dict[str, Any]:
+    """Assemble the same of scenes without a board; ``inputs`` are the digests of the view files by name."""
+    rows = [
+        {
+            "view": name,
+            "accepted": bool(count),
+            "reason": "" if count else solution.alone.get(k, "no silhouette beside which others see nothing"),
+            "rmse_mm": _finite(1e3 * off),
+            "inliers": int(count),
+            "fitness": None,
+            "condition": None,
+            "rotation_from_mean_deg": None,
+            "translation_from_mean_mm": None,
+        }
+        for k, (name, count, off) in enumerate(zip(inputs, solution.used, solution.off, strict=True))
+    ]
+    T = solution.T_tof_stereo
+    return _with_verdict(
+        {
+            "format": FORMAT,
+            "version": 1,
+            "backend": "silhouettes",
+            "method": "targetless",
+            "views": len(rows),
+            "used": int((solution.used > 0).sum()),
+            "T_tof_stereo": T.tolist(),
+            "initial_T_tof_stereo": initial.tolist(),
+            "working_point_m": solution.centre.tolist(),
+            **uncertainty_of(solution.influence, solution.covariance),
+            "pairs": rows,
+            "truth": None if true is None else _degrees_mm(*alignment_error(T, true), "_error"),
+            "provenance": {"versions": _versions(), "inputs": dict(inputs)},
+        }
+    )
+
+
+def _with_verdict(evidence: dict[str, Any]) -> dict[str, Any]:
     checks = judged_evidence(evidence)
     return {
         **evidence,
@@ -77,8 +120,9 @@ def judged_evidence(evidence: Mapping[str, Any]) -> list[Judged]:
     out = [
         judged("used", evidence["used"]),
         judged("rmse", median([p["rmse_mm"] for p in used]) if used else None),
-        judged("condition", max((p["condition"] for p in used), default=None)),
     ]
+    if evidence.get("method") != "targetless":
+        out.append(judged("condition", max((p["condition"] for p in used), default=None)))
     out += _both("spread", evidence["spread"]) + _both("error", evidence["standard_error"])
     if (C := covariance_of(evidence)) is not None:
         scale = np.repeat([1.0, ASIDE], 3)
@@ -153,13 +197,13 @@ def _pair(i: int, pair: Pair, solution: Solution) -> dict[str, Any]:
     return out
 
 
-def _versions(backend: str) -> dict[str, str]:
+def _versions(backend: str = "") -> dict[str, str]:
     out = {}
     for name in (
         "tofcapture",
         "numpy",
         "scipy",
-        *(("open3d-cpu", "open3d") if backend == "open3d" else (backend,)),
+        *(("open3d-cpu", "open3d") if backend == "open3d" else (backend,) if backend else ()),
     ):
         try:
             out[name] = version(name)
