@@ -25,7 +25,7 @@ from tofcapture.devices.sim.config import read_constants
 from tofcapture.devices.sim.scenes import TABLE_CENTRE, scene_objects
 from tofcapture.devices.sim.world import SimWorld
 from tofcapture.errors import ConfigError, DataError, QualityError
-from tofcapture.files.view import view_path, write_view
+from tofcapture.files.view import find_views, view_path, write_view
 from tofcapture.frames import ArmState, View
 from tofcapture.ops.project import triangulate
 from tofcapture.poses import exp, invert, look_at, transform
@@ -176,22 +176,18 @@ def test_scenes_align_the_cameras_as_well_as_the_board(tmp_path):
     assert (np.abs(error) < 3.5 * np.sqrt(np.diag(evidence["covariance"]))).all()
     assert evidence["used"] >= 10
     assert evidence["verdict"] in ("PASS", "WARN")
+    scenes = list(find_views(tmp_path).values())
+    with pytest.raises(QualityError, match="expected silhouettes in"):
+        align_scenes([scenes[0][:1]], rig)
+    far = replace(rig, T_tof_stereo=exp([0, 0, 0, 0.07, 0.05, 0.03]) @ rig.T_tof_stereo)
+    with pytest.raises(QualityError, match="targetless alignment"):
+        align_scenes(scenes, far)
+
+
+def test_what_it_cannot_start_from_is_named(tmp_path):
+    """A recording without scenes, and no rig at all."""
     with pytest.raises(ConfigError, match="starts from a rig"):
         align(tmp_path, method="targetless", initial="none")
-
-
-@pytest.mark.slow
-def test_a_bare_table_is_refused(tmp_path):
-    """Nothing ends before something deeper: no rig."""
-    world = recorded(tmp_path, ("random-548",), 3)
-    paths = [view_path(tmp_path, "random-548", k) for k in range(3)]
-    flat = replace(world.nominal_rig())
-    with pytest.raises(QualityError, match="expected"):
-        align_scenes([paths[:1]], flat)
-
-
-def test_a_recording_of_the_board_alone_is_named(tmp_path):
-    """Without scenes there is nothing to align by."""
     (tmp_path / "views").mkdir()
     with pytest.raises(DataError, match="views of scenes"):
         align(tmp_path, method="targetless")
