@@ -151,7 +151,9 @@ from pathlib import Path
 if __name__ == "__main__":
     from distributed import Client, LocalCluster
     from tofcapture.dataset.build import build_dataset
-    recording, out, kill = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3] == "kill"
+    from tofcapture.dataset.sample import SampleConfig
+    recording, out, kill = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[4] == "kill"
+    config = SampleConfig(truth=sys.argv[3])
     with LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
         def murder():
             while not list(out.glob("shards/.work-*")):  # a shard is in the making
@@ -161,25 +163,31 @@ if __name__ == "__main__":
             print("killed", flush=True)
         if kill:
             threading.Thread(target=murder, daemon=True).start()
-        result = build_dataset([recording], out, engine="dask", scheduler=cluster.scheduler_address)
+        result = build_dataset([recording], out, config=config, engine="dask", scheduler=cluster.scheduler_address)
         assert not result.failures, result.failures
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kill", ["", "kill"])
-def test_dask_makes_the_same(recording, calm, tmp_path, kill):
-    """Two Dask workers on the loopback interface, also when one is killed in the middle of a shard."""
-    pytest.importorskip("distributed")
-    script = tmp_path / "script.py"
+def built_by_dask(recording, out, truth="single", kill=""):
+    """Have two Dask workers on the loopback interface build a dataset; returns what the process said."""
+    script = out.parent / "script.py"
     script.write_text(DASK)
     done = subprocess.run(
-        [sys.executable, str(script), str(recording), str(tmp_path / "out"), kill],
+        [sys.executable, str(script), str(recording), str(out), truth, kill],
         capture_output=True,
         text=True,
         check=False,
         timeout=250,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    assert ("killed" in done.stdout) == bool(kill)
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kill", ["", "kill"])
+def test_dask_makes_the_same(recording, calm, tmp_path, kill):
+    """Also when a worker is killed in the middle of a shard."""
+    pytest.importorskip("distributed")
+    said = built_by_dask(recording, tmp_path / "out", kill=kill)
+    assert ("killed" in said) == bool(kill)
     assert_same(tmp_path / "out", calm)

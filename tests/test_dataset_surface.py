@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.test_dataset_engines import built_by_dask
 from tofcapture.cli import main
 from tofcapture.dataset.build import build_dataset
 from tofcapture.dataset.sample import SampleConfig
@@ -148,6 +149,15 @@ def test_two_processes_give_the_same_bytes(recording, fused, tmp_path):
     again = build_dataset([recording], tmp_path / "dataset", jobs=2, config=FUSED)
     assert again.scenes == fused.scenes
     assert build_dataset([recording], tmp_path / "dataset", jobs=2, config=FUSED).skipped == ("mug",)
+
+
+@pytest.mark.slow
+def test_dask_gives_the_same_bytes(recording, fused, tmp_path):
+    """Two workers fuse what one process does."""
+    pytest.importorskip("distributed")
+    built_by_dask(recording, tmp_path / "dataset", "fused")
+    for name in ("manifest.json", "shards/mug.h5", "shards/mug.sha256"):
+        assert (tmp_path / "dataset" / name).read_bytes() == (fused.dataset / name).read_bytes()
 
 
 @pytest.mark.slow
