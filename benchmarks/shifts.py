@@ -38,6 +38,7 @@ from tofcapture.devices.sim.sensor import expose
 from tofcapture.devices.sim.transport import Lamp, Transport
 from tofcapture.devices.sim.world import SimWorld
 from tofcapture.devices.station import read_station
+from tofcapture.errors import DataError
 from tofcapture.files.manifest import manifest_path
 from tofcapture.files.seal import replacing, sha256_of, write_text
 from tofcapture.files.shard import ShardReader
@@ -501,7 +502,10 @@ def score(args: argparse.Namespace) -> dict[str, list[Measured]]:
                             raw, info = shard.raw(view, 0), replace(shard.info, camera=shard.camera)
                         else:
                             raw, info = exposed(args.folder, row, shard.scene, view, number)
-                        out[name].append(measure(predictor, shard, view, raw, info, row, known))
+                        try:
+                            out[name].append(measure(predictor, shard, view, raw, info, row, known))
+                        except DataError as err:  # nothing measures there, as `predict` would say
+                            print(f"{name}, {shard.scene}, view {view}: refused: {err.message}")
             kept.parent.mkdir(exist_ok=True)
             write_text(kept, json.dumps(known))
     return {name: found for name, found in out.items() if any(r["network"]["pixels"] for r in found)}
