@@ -308,7 +308,7 @@ def asked(views: list[View], index: int) -> dict[str, np.ndarray]:
 
 def sparsified(error: np.ndarray, by: np.ndarray) -> float:
     """Area between the sparsification curve by a key and the best there is, in mean errors; NaN with infinite errors."""
-    shares = np.arange(1, 21) * len(error) // 20
+    shares = np.maximum(np.arange(1, 21) * len(error) // 20, 1)
     curves = []
     for key in (by, error):
         best = np.cumsum(error[np.argsort(key, kind="stable")], dtype=float)
