@@ -232,4 +232,4 @@ sys.exit(main(["doctor"]))
     )
     assert done.returncode == 143
     assert done.stdout == "put away\n"
-    assert done.stderr.endswith("tofcapture: terminated\n  try: run the same command again to go on\n")
+    assert done.stderr == "tofcapture: terminated\n  try: run the same command again to go on\n"

@@ -183,7 +183,8 @@ class _Terminated(KeyboardInterrupt):
 def _terminable() -> Iterator[None]:
     """Let SIGTERM end a command as Ctrl-C does; commands that have their own way, as the daemon, replace it.
 
-    What is raised in a callback of a library, or while an object goes, Python ignores: it is raised again until it is on its way.
+    What is raised in a callback of a library, or while an object goes, Python ignores, which nobody needs to
+    read: it is raised again until it is on its way.
     """
 
     def end(number: int, _: object) -> None:
@@ -199,14 +200,20 @@ def _terminable() -> Iterator[None]:
         if error is None:
             raise _Terminated
 
+    def unraisable(what: Any) -> None:
+        if not issubclass(what.exc_type, _Terminated):
+            usual(what)
+
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = {number: signal.getsignal(number) for number in (signal.SIGALRM, signal.SIGTERM)}
+    usual, sys.unraisablehook = sys.unraisablehook, unraisable
     signal.signal(signal.SIGTERM, end)
     try:
         yield
     finally:
+        sys.unraisablehook = usual
         if signal.getsignal(signal.SIGALRM) is again:
             signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in before.items():
