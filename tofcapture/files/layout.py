@@ -32,7 +32,7 @@ MASK_DOCS = {
     MaskBit.NOT_HIT: "the ray hits no measured surface; depth and normal are NaN",
     MaskBit.OCCLUDED: "the ray first crosses space that the stereo camera cannot see",
     MaskBit.GRAZING: "either camera sees the surface at more than 75 degrees",
-    MaskBit.EDGE: "within one 1x pixel of a depth edge or a hole",
+    MaskBit.EDGE: "near a depth edge or a hole (1x pixel), or doubtfully fused",
     MaskBit.OUTSIDE: "outside the crop around the scene's object: table and background",
 }
 
