@@ -1,9 +1,9 @@
 """Views per second of build-dataset, whole: reading, decoding, ground truth, compression, verification, fsync.
 
-    python -m benchmarks.build RECORDING [--jobs 2] [--peer-views 2] [--skip-peer]
+    python -m benchmarks.build RECORDING... [--jobs 2] [--truth fused] [--scales 1 2 4] [--peer-views 2] [--skip-peer]
 
-A simulated recording, with the true rig. Printed: views/s of the build by wall clock and by CPU time (all processes), the largest
-process, seconds per stage of one view (CPU, median over views), and the same of a plain Open3D script (build_peer.py) on the
+Simulated recordings, with the true rig. Printed: views/s of the build by wall clock and by CPU time (all processes), the largest
+process, seconds per stage of one view (CPU, median over views, of its own truth), and the same of a plain Open3D script (build_peer.py) on the
 first views of the same recording in the same run, with both errors of ground truth: over our pixels, where both have depth.
 Compilation happens once a machine and is left out by building one scene first.
 """
@@ -71,21 +71,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("recording", type=Path)
+    parser.add_argument("recordings", type=Path, nargs="+")
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--truth", default="single")
+    parser.add_argument("--scales", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--peer-views", type=int, default=2)
     parser.add_argument("--skip-peer", action="store_true")
     args = parser.parse_args()
     folder = Path(tempfile.mkdtemp())
+    config = SampleConfig(truth=args.truth, scales=tuple(args.scales))
     try:
-        tasks = scene_tasks([args.recording], folder / "dataset", true_rig=True)
+        tasks = scene_tasks(args.recordings, folder / "dataset", true_rig=True)
         rig, views = tasks[0].rig, [v for t in tasks for v in t.views]
         stages(views[:1], rig, folder)  # compiles
         found = stages(views[:: max(1, len(views) // 6)], rig, folder)
         for name, seconds in found.seconds.items():
             print(f"  {name:<20} {1e3 * statistics.median(seconds):7.1f} ms of CPU")
         wall, used = time.perf_counter(), cpu()
-        result = build_dataset([args.recording], folder / "dataset", true_rig=True, jobs=args.jobs)
+        result = build_dataset(
+            args.recordings, folder / "dataset", true_rig=True, config=config, jobs=args.jobs
+        )
         wall, used = time.perf_counter() - wall, cpu() - used
         ours = len(views) / wall
         print(f"ours: {len(views)} views, {ours:.2f} views/s by the clock with {args.jobs} processes, start included; "

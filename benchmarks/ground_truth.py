@@ -17,7 +17,8 @@ them, built twice, with exact poses and with an arm that repeats to 0.1 mm (and 
 0.5 mm and 0.1 degrees off. Asked for are the object's pixels that any stereo view measured, real depth edges apart; by class: rim
 (within 4 ToF pixels of an edge), shadow (not hit or occluded for the own stereo camera), hollow (0.5 mm deeper than 8 pixels
 about it), flat (the rest). ``ause`` is the area between two sparsification curves, of errors in the order of sigma, or of depth,
-and in their own order, in mean errors: 0 is perfect. ``--recordings`` keeps what is simulated for the next time.
+and in their own order, in mean errors: 0 is perfect. ``--recordings`` keeps what is simulated for the next time, or is a
+simulated recording itself, as ``demo-out/recording``: then with ``--poses exact`` its scenes are compared, with the true rig.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tofcapture.dataset.build import build_dataset
+from tofcapture.dataset.build import build_dataset, scene_tasks
 from tofcapture.dataset.sample import SampleConfig, decoder_for, make_sample
 from tofcapture.devices.clearance import workcell_of
 from tofcapture.devices.kinematics import arm_model
@@ -52,7 +53,7 @@ from tofcapture.ops.denoise import denoise
 from tofcapture.ops.project import edges
 from tofcapture.poses import Float64, exp, invert, look_at, transform, transform_points
 from tofcapture.record.plan import object_sampling, plan_views
-from tofcapture.rig import dumps_rig
+from tofcapture.rig import dumps_rig, load_rig
 
 FAST = {"render": {"multipath": False, "subpixels": 1}}  # the ToF camera's light is no matter here
 DISTANCES = (0.45, 0.8, 1.4)
@@ -277,6 +278,14 @@ def disturbed(exact: Path, name: str, seed: int, folder: Path) -> None:
     (folder / "rig.toml").write_text(dumps_rig(replace(rig, T_flange_tof=rig.T_flange_tof @ HAND_EYE)))
 
 
+def taken(recording: Path, name: str, folder: Path) -> None:
+    """Lay down one scene of a recording as :func:`planned` does, with the true rig."""
+    task = next(t for t in scene_tasks([recording], folder, true_rig=True) if t.scene == name)
+    (folder / "views").mkdir(parents=True)
+    (folder / "views" / name).symlink_to(task.views[0].parent, target_is_directory=True)
+    (folder / "rig.toml").write_text(dumps_rig(task.rig))
+
+
 def asked(views: list[View], index: int) -> dict[str, np.ndarray]:
     """Pixels (2H, 2W) of a view by class; ``all`` of them are the object's, measured by a view, and at no real edge."""
     view, rig = views[index], views[index].rig
@@ -319,10 +328,15 @@ def sparsified(error: np.ndarray, by: np.ndarray) -> float:
 
 def compare(name: str, seed: int, count: int, kept: Path, poses_of: tuple[str, ...], folder: Path) -> None:
     """Print single and fused truth of one scene, with exact poses and with bad ones; ``kept`` holds its recordings."""
-    if not (kept / "off/rig.toml").exists():
+    if (kept.parent / "views").is_dir():
+        kept, recording = folder / "kept", kept.parent
+        taken(recording, name, kept / "exact")
+    elif not (kept / "off/rig.toml").exists():
         planned(name, seed, count, kept / "exact")
         disturbed(kept / "exact", name, seed, kept / "off")
-    views = [open_view(p) for p in sorted((kept / "exact/views" / name).glob("view-*.h5"))]
+    rig = load_rig(kept / "exact/rig.toml")
+    paths = sorted((kept / "exact/views" / name).glob("view-*.h5"))
+    views = [replace(open_view(p), rig=rig) for p in paths]
     classes = [asked(views, k) for k in range(len(views))]
     single = build_dataset([kept / "exact"], folder / "single", config=SampleConfig(truth="single"), jobs=1)
     for poses in poses_of:

@@ -280,7 +280,7 @@ def _samples(planes: NDArray[np.float32], quads: NDArray[np.uint8], camera: Came
         m = planes.reshape(-1, 5)[at].astype(np.float64)
         size = np.linalg.norm(m[:, :3], axis=1)
         n = -m[:, :3] / size[:, None]
-        bucket = np.unique(np.rint(3 * n).astype(np.int64) @ [1, 10, 100], return_inverse=True)[1]
+        bucket = np.rint(3 * n).astype(np.int64) @ [1, 10, 100] + 333
         often = np.bincount(bucket)[bucket]
         picked = rng.choice(len(at), min(wanted, len(at)), replace=False, p=1 / often / (1 / often).sum())
         picked.sort()
@@ -315,27 +315,25 @@ def fused(
     doubtful, others = np.zeros((2, *camera.shape), dtype=bool)
     sigma, views = np.full(camera.shape, np.nan), np.zeros(camera.shape, dtype=np.int8)
     window = np.s_[:, :] if len(members) == 1 else _window(surface, own, rig, camera)
-    part = np.ascontiguousarray(rays[window].reshape(-1, 3))
+    part = np.array(rays[window], order="C").reshape(-1, 3)
+    look = _Window(camera, rays[window])
     hits = Hits.none(len(T_tof_stereo), len(part))
     off = surface.relative(own, rig.T_tof_stereo)
     for k in members.tolist():
         top, bottom, left, right = clouds.boxes[k].tolist()
         if k == own:
-            z, place = seen.depth[window], seen.pixels[window] / 2
+            top, left = 0, 0
+            met = np.concatenate([seen.depth[window][..., None], seen.pixels[window] / 2], axis=-1)
         elif top < bottom:
             box = np.s_[top:bottom, left:right]
             cut = (clouds.quads[k, top : bottom - 1, left : right - 1] & SURFACE) > 0
-            z, place = _met(
-                clouds.depth[k][box], cut, x[left:right], y[top:bottom], T_tof_stereo[k], camera, window, far
-            )
-            place = place + np.array([left, top])
+            met = look.met(clouds.depth[k][box], cut, x[left:right], y[top:bottom], T_tof_stereo[k], far)
         else:
             continue
-        meet(hits, k, z.ravel(), place.reshape(-1, 2), clouds, T_tof_stereo[k], part, off[k, :, k])
+        meet(hits, k, met.reshape(-1, 3), (top, left), clouds, T_tof_stereo[k], part, off[k, :, k])
     near, clear = _entry(surface, own, rig, part), ~seen.occluded[window].ravel()
-    found = fuse(hits, members, own, clouds, T_tof_stereo, eye, part, off, near, clear)
-    shape = others[window].shape
-    more = (np.isfinite(hits.depth).sum(axis=0) > np.isfinite(hits.depth[own])).reshape(shape)
+    found = fuse(hits, members, own, clouds, T_tof_stereo, eye, part, off, near, clear, look.shape[1])
+    shape, more = look.shape, found.others.reshape(look.shape)
     others[window] = more
     depth[window] = np.where(more, found.depth.reshape(shape), depth[window])
     normals[window] = np.where(more[..., None], found.normals.reshape(*shape, 3), normals[window])
@@ -360,32 +358,36 @@ def _window(surface: Surface, own: int, rig: Rig, camera: Camera) -> tuple[slice
         np.floor(at.min(axis=0)).astype(int),
         np.ceil(at.max(axis=0)).astype(int) + 1,
     )
-    return np.s_[max(top, 0) : max(bottom, 1), max(left, 0) : max(right, 1)]
+    top, left = np.clip((top, left), 0, np.array(camera.shape) - 1)  # one pixel at least
+    return np.s_[top : max(bottom, 1), left : max(right, 1)]
 
 
 def _entry(surface: Surface, own: int, rig: Rig, rays: Float64) -> Float64:
     """Depth at which rays (P, 3) of a view enter the box about the object, metres."""
     T_base_tof = surface.poses[own] @ invert(rig.T_tof_stereo)
+    low, high = surface.bounds[surface.group[own]] - T_base_tof[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        walls = (surface.bounds[surface.group[own], :, None] - T_base_tof[:3, 3]) / rotate_vectors(
-            T_base_tof, rays
-        )
-    return np.asarray(walls.min(axis=0).max(axis=-1))
+        way = 1 / rotate_vectors(T_base_tof, rays)
+        walls = np.minimum(low * way, high * way)
+    return np.asarray(np.maximum(np.maximum(walls[:, 0], walls[:, 1]), walls[:, 2]))
 
 
-def _met(
-    depth: NDArray[np.float32], cut: NDArray[np.bool_], x: Float64, y: Float64, T: Float64, camera: Camera,
-    window: tuple[slice, slice], far: float,
-) -> tuple[Float64, Float64]:  # fmt: skip
-    """Find what the rays of a window of an image meet of one view's surface; a lens's are those of the nearest finer pixels."""
-    rays = camera.rays[window]
-    finer = LENS_FINER if camera.distortion else 1
-    low, high = rays[..., :2].min(axis=(0, 1)), rays[..., :2].max(axis=(0, 1))
-    focal = finer * np.array([camera.fx, camera.fy])
-    width, height = (np.rint((high - low) * focal).astype(int) + 1).tolist()
-    eye = Camera(width, height, *focal.tolist(), *(-low * focal).tolist())
-    z, place = place_hits(depth, cut, x, y, T, eye, far)
-    if finer == 1:
-        return z, place
-    u, v = np.rint(eye.project(rays)[0]).astype(np.intp).transpose(2, 0, 1)
-    return z[v, u], place[v, u]
+class _Window:
+    """Look up what the rays (H, W, 3) of a window of an image meet; a lens's are those of the nearest finer pixels."""
+
+    def __init__(self, camera: Camera, rays: Float64) -> None:
+        finer = LENS_FINER if camera.distortion else 1
+        low, high = (f(rays[..., :2].reshape(-1, 2).T.copy(), axis=1) for f in (np.min, np.max))
+        focal = finer * np.array([camera.fx, camera.fy])
+        width, height = (np.rint((high - low) * focal).astype(int) + 1).tolist()
+        self._eye = Camera(width, height, *focal.tolist(), *(-low * focal).tolist())
+        self._at = None if finer == 1 else np.rint(self._eye.project(rays)[0]).astype(np.intp)
+        self._found = np.empty((height, width, 3))
+        self.shape: tuple[int, int] = rays.shape[:2]
+
+    def met(
+        self, depth: NDArray[np.float32], cut: NDArray[np.bool_], x: Float64, y: Float64, T: Float64, far: float
+    ) -> Float64:  # fmt: skip
+        """Find (H, W, 3) where the rays meet one view's surface, as :func:`place_hits` does; the next call overwrites it."""
+        place_hits(depth, cut, x, y, T, self._eye, far, self._found)
+        return self._found if self._at is None else self._found[self._at[..., 1], self._at[..., 0]]

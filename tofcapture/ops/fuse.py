@@ -26,9 +26,7 @@ AGREE = 4.0  # standard deviations, and
 AGREE_M = 0.0004  # m; two surfaces further apart are two
 PAST = 0.003  # m; a view sees past a point that is so much nearer than what it saw
 FLOOR = 1.5e-6  # m; what planes leave out, and no average takes away
-LARGEST = (
-    0.45  # of a point's deviation: a plane that is less sure is of a small window; the surface may be bent
-)
+LARGEST = 0.45  # of a point's deviation: a plane that is less sure is of a small window and may be bent
 BENT = 0.3  # of such a plane's deviation, by which all views alike may miss a bent surface
 BEHIND = 0.004  # m; so near behind a surface more views must not hold another one for the first
 UNSURE = 0.0005  # m; a depth whose standard deviation is larger is doubtful
@@ -36,7 +34,7 @@ STEP = 0.004  # m, between places on a ray that must be empty
 CLEAR = 0.005  # m; the last of them before the surface
 CHANCE = 2.0  # times its mean; so large the scatter of a few depths may be without being an error
 LEAST_SLOPE = 0.02  # metres along the normal for a metre of depth; surfaces that are seen more from their side are edges
-UNFLAT = 1.0  # times the noise, where no plane fits
+TILE = 16  # pixels that are fused together
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,8 @@ class Hits:
     def none(views: int, pixels: int) -> Hits:
         """Return hits of nothing."""
         nothing = np.full((views, pixels), np.nan, dtype=np.float32)
-        return Hits(nothing, nothing.copy(), nothing.copy(), np.zeros((views, pixels), dtype=np.int32))
+        sigma, noise = np.empty_like(nothing), np.empty_like(nothing)
+        return Hits(nothing, sigma, noise, np.empty_like(nothing, np.int32))
 
 
 @dataclass(frozen=True)
@@ -77,44 +76,36 @@ class Fused:
     depth: Float64  #: (P,) metres; NaN: none.
     normals: Float64  #: (P, 3) unit, facing the camera.
     sigma: Float64  #: (P,) metres, one standard deviation of depth.
-    views: NDArray[
-        np.int8
-    ]  #: (P,) how many views it is made of; negative where the target's own is not among them.
+    views: NDArray[np.int8]  #: (P,) how many it is made of; negative: the target's own is not among them.
     doubtful: Bool  #: (P,) made of points that no view is sure of, or held by fewer views than what is behind it, or refuted.
     occluded: Bool  #: (P,) the way there is not known to be empty.
+    others: Bool  #: (P,) met by another view than the target's own.
 
 
 def meet(
-    hits: Hits, view: int, depth: Float64, pixels: Float64, clouds: Clouds, T_target_stereo: Float64, rays: Float64,
+    hits: Hits, view: int, met: Float64, corner: tuple[int, int], clouds: Clouds, T_target_stereo: Float64, rays: Float64,
     off: Float64,
 ) -> None:  # fmt: skip
     """Put into ``hits`` what the target's rays (P, 3) meet of one view.
 
-    ``depth`` (P,) and ``pixels`` (P, 2), counted in cells, are what :func:`tofcapture.ops.project.place_hits` found. ``off`` (6, 6) is the
-    covariance of the view's pose as a twist in the target's frame.
+    ``met`` (P, 3), depth and place in cells, the first of them in row and column ``corner`` of the view's, is what
+    :func:`tofcapture.ops.project.place_hits` found. ``off`` (6, 6) is the covariance of the view's pose as a twist in the target's frame.
     """
     _meet(
-        depth, pixels, clouds.planes[view], clouds.quads[view], T_target_stereo, rays, off,
+        met, *corner, clouds.planes[view], clouds.quads[view], T_target_stereo, rays, off,
         hits.depth[view], hits.sigma[view], hits.noise[view], hits.cell[view],
     )  # fmt: skip
 
 
 def fuse(
-    hits: Hits,
-    members: NDArray[np.intp],
-    own: int,
-    clouds: Clouds,
-    T_target_stereo: Float64,
-    eye: Float64,
-    rays: Float64,
-    off: Float64,
-    near: Float64,
-    clear: Bool,
-) -> Fused:
+    hits: Hits, members: NDArray[np.intp], own: int, clouds: Clouds, T_target_stereo: Float64, eye: Float64,
+    rays: Float64, off: Float64, near: Float64, clear: Bool, columns: int,
+) -> Fused:  # fmt: skip
     """Fuse the hits of the views that are members.
 
     ``own`` is the target's own view, ``T_target_stereo`` (N, 4, 4), ``eye`` fx, fy, cx, cy of the stereo grid, ``off``
-    (N, 6, N, 6) the covariance of all views' poses as twists in the target's frame. Up to ``near`` (P,) metres deep there is nothing; the own view saw that there is nothing before its hit where it is ``clear`` (P,).
+    (N, 6, N, 6) the covariance of all views' poses as twists in the target's frame. Up to ``near`` (P,) metres deep there is
+    nothing; the own view saw that there is nothing before its hit where it is ``clear`` (P,). The image has so many ``columns``.
     """
     pixels = hits.depth.shape[1]
     out = Fused(
@@ -122,36 +113,46 @@ def fuse(
         np.full((pixels, 3), np.nan),
         np.full(pixels, np.nan),
         np.zeros(pixels, dtype=np.int8),
-        np.asarray(np.isfinite(hits.depth).any(axis=0)),
-        np.zeros(pixels, dtype=bool),
+        *np.zeros((3, pixels), dtype=bool),
     )
-    back = np.stack([_inverse(T) for T in T_target_stereo])
+    into = _images(T_target_stereo, eye)
+    pairs = np.ascontiguousarray(off.swapaxes(1, 2)).reshape(*off.shape[::2], 36)
     _fuse(
-        hits.depth, hits.sigma, hits.noise, off, hits.cell, members, own, clouds.planes, clouds.free, T_target_stereo, back, eye, rays, near, clear,
-        out.depth, out.normals, out.sigma, out.views, out.doubtful, out.occluded,
+        _tiled(pixels // columns, columns), hits.depth, hits.sigma, hits.noise, pairs, hits.cell, members, own, clouds.planes, clouds.free, T_target_stereo, into, rays, near, clear,
+        out.depth, out.normals, out.sigma, out.views, out.doubtful, out.occluded, out.others,
     )  # fmt: skip
     return out
 
 
-def _inverse(T: Float64) -> Float64:
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
-    return out
+def _tiled(rows: int, columns: int) -> NDArray[np.intp]:
+    """Number an image's pixels tile by tile: what neighbours look up in other images is still in the processor's cache."""
+    high, wide = -(-rows // TILE), -(-columns // TILE)
+    number = np.full((high * TILE, wide * TILE), -1, dtype=np.intp)
+    number[:rows, :columns] = np.arange(rows * columns).reshape(rows, columns)
+    tiles = number.reshape(high, TILE, wide, TILE).swapaxes(1, 2).ravel()
+    return np.asarray(tiles[tiles >= 0])
+
+
+def _images(T_target_stereo: Float64, eye: Float64) -> Float64:
+    """Return (3, 4, N): what maps points of the target's frame to column and row of a view's cells, times depth, and to depth."""
+    turned = T_target_stereo[:, :3, :3].transpose(0, 2, 1)
+    back = np.concatenate([turned, -turned @ T_target_stereo[:, :3, 3:]], axis=2)
+    fx, fy, cx, cy = eye / 2
+    return np.ascontiguousarray((np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) @ back).transpose(1, 2, 0))
 
 
 @compiled
 def _meet(
-    depth: Float64, pixels: Float64, planes: Float32, quads: NDArray[np.uint8], pose: Float64, rays: Float64, off: Float64,
+    met: Float64, top: int, left: int, planes: Float32, quads: NDArray[np.uint8], pose: Float64, rays: Float64, off: Float64,
     out: Float32, sigma: Float32, noise: Float32, cell: NDArray[np.int32],
 ) -> None:  # fmt: skip
     """Move hits onto the planes that fit about them, as those of one view alone are, and say how sure each is."""
     height, width = planes.shape[:2]
     m, J = np.empty(3), np.empty(6)
-    for i in range(len(depth)):
-        z = depth[i]
-        if not z > 0:
+    for i in range(len(met)):
+        z, u, v = met[i, 0], met[i, 1] + left, met[i, 2] + top
+        if not 0 < z < np.inf:
             continue
-        u, v = pixels[i, 0], pixels[i, 1]
         column, row = min(int(u + 0.25), width - 1), min(int(v + 0.25), height - 1)
         plane = planes[row, column]
         for k in range(3):
@@ -171,8 +172,6 @@ def _meet(
         there = (1 + m[0] * pose[0, 3] + m[1] * pose[1, 3] + m[2] * pose[2, 3]) / along
         if plane[4] > 0 and abs(there - z) * along / size <= WITHIN * error:
             out[i], error = there, own_z * plane[4] / size
-        else:
-            error *= UNFLAT
         trusted = (
             quads[min(int(v), height - 2), min(int(u), width - 2)] & INNER
             and 1 / (size * np.sqrt(distance)) > GRAZING_COSINE
@@ -203,37 +202,60 @@ def _product(J: Float64, off: Float64) -> float:
 
 
 @compiled
-def _empty(free: Float32, back: Float64, eye: Float64, x: float, y: float, z: float, beyond: float) -> bool:
-    """Tell whether a view sees so far past a point of the target's frame."""
-    own = back[2, 0] * x + back[2, 1] * y + back[2, 2] * z + back[2, 3]
-    if not own > 0:
-        return False
-    u = eye[0] * (back[0, 0] * x + back[0, 1] * y + back[0, 2] * z + back[0, 3]) / own + eye[2]
-    v = eye[1] * (back[1, 0] * x + back[1, 1] * y + back[1, 2] * z + back[1, 3]) / own + eye[3]
-    height, width = free.shape
-    if not (0 <= u < 2 * width and 0 <= v < 2 * height):
-        return False
-    return free[int(v) // 2, int(u) // 2] - own > beyond  # type: ignore[no-any-return]
+def _ways(into: Float64, ray: Float64, way: Float64) -> None:
+    """Write into ``way`` (3, N) where a ray (3,) goes in the image of every view: ``into`` (3, 4, N) are those of :func:`_images`."""
+    x, y, z = ray
+    for k in range(3):
+        for j in range(way.shape[1]):  # innermost: it becomes vector instructions
+            way[k, j] = into[k, 0, j] * x + into[k, 1, j] * y + into[k, 2, j] * z
+
+
+@compiled
+def _places(into: Float64, way: Float64, z: float, place: Float64) -> None:
+    """Write into ``place`` (3, N) the column and row of cells, and the depth, at which every view has depth z of a ray."""
+    for j in range(way.shape[1]):
+        place[2, j] = z * way[2, j] + into[2, 3, j]
+    for k in range(2):
+        for j in range(way.shape[1]):
+            place[k, j] = (z * way[k, j] + into[k, 3, j]) / place[2, j]
+
+
+@compiled
+def _free(free: Float32, j: int, u: float, v: float, own: float) -> float:
+    """Tell how far view ``j`` of (N, h, w) sees past a place in its image; not above 0: it does not."""
+    if not (own > 0 and 0 <= u < free.shape[2] and 0 <= v < free.shape[1]):
+        return 0.0
+    return free[j, int(v), int(u)] - own  # type: ignore[no-any-return]
+
+
+@compiled
+def _empty(free: Float32, into: Float64, way: Float64, j: int, z: float) -> bool:
+    """Tell whether view ``j`` sees past depth z of a ray."""
+    own = z * way[2, j] + into[2, 3, j]
+    u, v = (z * way[0, j] + into[0, 3, j]) / own, (z * way[1, j] + into[1, 3, j]) / own
+    return _free(free, j, u, v, own) > 0
 
 
 @compiled
 def _fuse(
-    depth: Float32, sigma: Float32, noise: Float32, off: Float64, cell: NDArray[np.int32], members_of: NDArray[np.intp], own: int, planes: Float32, free: Float32,
-    poses: Float64, backs: Float64, eye: Float64, rays: Float64, near: Float64, clear: Bool,
-    out: Float64, normals: Float64, deviation: Float64, views: NDArray[np.int8], doubtful: Bool, occluded: Bool,
+    turn: NDArray[np.intp], depth: Float32, sigma: Float32, noise: Float32, off: Float64, cell: NDArray[np.int32], members_of: NDArray[np.intp], own: int, planes: Float32, free: Float32,
+    poses: Float64, into: Float64, rays: Float64, near: Float64, clear: Bool,
+    out: Float64, normals: Float64, deviation: Float64, views: NDArray[np.int8], doubtful: Bool, occluded: Bool, others: Bool,
 ) -> None:  # fmt: skip
-    """Fuse the hits (N, P) of all pixels; see :func:`fuse`."""
-    count, pixels = depth.shape
+    """Fuse the hits (N, P) of all pixels, in ``turn``; see :func:`fuse`."""
+    count = len(depth)
     width = planes.shape[2]
     order, kept, member = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.bool_)
     slope, weight = np.empty(count), np.empty(count)
-    m, J = np.empty(3), np.empty(6)
-    for i in range(pixels):
+    m, J, M = np.empty(3), np.empty(6), np.empty(36)
+    way, place, last = np.empty((3, count)), np.empty((3, count)), own  # the last that saw past a place
+    for i in turn:
         found = 0
         for j in range(count):
             if depth[j, i] > 0:
                 order[found] = j
                 found += 1
+                others[i] |= j != own
         for a in range(1, found):  # by insertion: they are few
             j, b = order[a], a
             while b > 0 and depth[order[b - 1], i] > depth[j, i]:
@@ -243,13 +265,16 @@ def _fuse(
         if not found:
             continue
         x, y, w = rays[i, 0], rays[i, 1], rays[i, 2]
+        doubtful[i] = True
+        _ways(into, rays[i], way)
         for a in range(found):  # metres along the normal for a metre of depth
             j = order[a]
-            plane, pose = planes[j, cell[j, i] // width, cell[j, i] % width], poses[j]
-            size = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
+            row, column = cell[j, i] // width, cell[j, i] % width
+            p, q, r = planes[j, row, column, 0], planes[j, row, column, 1], planes[j, row, column, 2]
+            size = np.sqrt(p**2 + q**2 + r**2)
             along = 0.0
             for k in range(3):
-                along += rays[i, k] * (pose[k, 0] * plane[0] + pose[k, 1] * plane[1] + pose[k, 2] * plane[2])
+                along += rays[i, k] * (poses[j, k, 0] * p + poses[j, k, 1] * q + poses[j, k, 2] * r)
             slope[j] = max(along / size, LEAST_SLOPE)
         for first in range(found):
             begin = order[first]
@@ -264,8 +289,10 @@ def _fuse(
                 behind += not member[j] and sigma[j, i] > 0 and 0 < depth[j, i] - depth[begin, i] < BEHIND
             z = float(depth[begin, i])
             past = 0
-            for j in members_of[: 0 if 2 * members >= len(members_of) else len(members_of)]:
-                past += _empty(free[j], backs[j], eye, z * x, z * y, z * w, PAST)
+            if 2 * members < len(members_of):
+                _places(into, way, z, place)
+                for j in members_of:
+                    past += _free(free, j, place[0, j], place[1, j], place[2, j]) > PAST
             if past > members:
                 continue
             used = 0
@@ -281,16 +308,15 @@ def _fuse(
             for j in kept[:used]:
                 views[i] += 1
                 has_own |= j == own
-                plane, pose = planes[j, cell[j, i] // width, cell[j, i] % width], poses[j]
-                if plane[4] > LARGEST * plane[3]:
+                row, column = cell[j, i] // width, cell[j, i] % width
+                p, q, r = planes[j, row, column, 0], planes[j, row, column, 1], planes[j, row, column, 2]
+                if planes[j, row, column, 4] > LARGEST * planes[j, row, column, 3]:
                     bent += weight[j] * BENT * noise[j, i]
-                size = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
+                size = np.sqrt(p**2 + q**2 + r**2)
                 share = 1 / (size * sigma[j, i] ** 2)
                 if slope[j] > LEAST_SLOPE:  # those that face away say nothing
                     for k in range(3):
-                        m[k] -= share * (
-                            pose[k, 0] * plane[0] + pose[k, 1] * plane[1] + pose[k, 2] * plane[2]
-                        )
+                        m[k] -= share * (poses[j, k, 0] * p + poses[j, k, 1] * q + poses[j, k, 2] * r)
             size = np.sqrt(m[0] ** 2 + m[1] ** 2 + m[2] ** 2)
             if size == 0:
                 m[0], m[1], m[2], size = -x, -y, -w, np.sqrt(x * x + y * y + w * w)
@@ -298,17 +324,17 @@ def _fuse(
                 normals[i, k] = m[k] / size
             steepest = max(-normals[i, 0] * x - normals[i, 1] * y - normals[i, 2] * w, LEAST_SLOPE)
             _lever(rays[i], out[i], normals[i, 0], normals[i, 1], normals[i, 2], J)
-            off_normal = _unplaced(J, off, kept[:used], weight) + FLOOR**2 + bent**2
+            off_normal = _unplaced(J, off, kept, used, weight, M) + FLOOR**2 + bent**2
             deviation[i] = np.sqrt(beyond * left + beyond * off_normal / steepest**2)
             views[i] = views[i] if has_own else -views[i]
             doubtful[i] = sure == 0 or behind > sure or deviation[i] > UNSURE
-            last, z = own, out[i] - CLEAR
+            z = out[i] - CLEAR
             while z > near[i] and not (has_own and clear[i]):
-                empty = _empty(free[last], backs[last], eye, z * x, z * y, z * w, 0.0)
+                empty = _empty(free, into, way, last, z)
                 for j in members_of:
                     if empty:
                         break
-                    empty = _empty(free[j], backs[j], eye, z * x, z * y, z * w, 0.0)
+                    empty = _empty(free, into, way, j, z)
                     if empty:
                         last = j
                 if not empty:
@@ -349,15 +375,22 @@ def _average(
 
 
 @compiled
-def _unplaced(J: Float64, off: Float64, kept: NDArray[np.int64], weight: Float64) -> float:
-    """Return the variance, m^2, along a normal of the mean surface through the poses of the views that are ``kept``.
+def _unplaced(
+    J: Float64, off: Float64, kept: NDArray[np.int64], used: int, weight: Float64, M: Float64
+) -> float:
+    """Return the variance, m^2, along a normal of the mean surface through the poses of the first ``used`` views that are ``kept``.
 
-    ``J`` (6,) is the normal's, ``off`` (N, 6, N, 6); what is off in all views alike stays in the mean.
+    ``J`` (6,) is the normal's, ``off`` (N, N, 36); what is off in all views alike stays in the mean. ``M`` (36,) is for its use.
     """
+    M[:] = 0
+    for a in range(used):
+        for b in range(a + 1):
+            j, k = kept[a], kept[b]
+            share = (1.0 if a == b else 2.0) * weight[j] * weight[k]
+            for c in range(36):
+                M[c] += share * off[j, k, c]
     total = 0.0
-    for a in range(len(kept)):
-        j = kept[a]
-        total += weight[j] ** 2 * _product(J, off[j, :, j])
-        for k in kept[:a]:
-            total += 2 * weight[j] * weight[k] * _product(J, off[j, :, k])
+    for a in range(6):
+        for b in range(6):
+            total += J[a] * M[6 * a + b] * J[b]
     return max(total, 0.0)

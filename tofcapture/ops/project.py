@@ -168,23 +168,19 @@ def project(
 
 
 def place_hits(
-    depth: NDArray[np.floating], surface: Bool, x: Float64, y: Float64, T: Float64, camera: Camera, far: float
-) -> tuple[Float64, Float64]:
+    depth: NDArray[np.floating], surface: Bool, x: Float64, y: Float64, T: Float64, camera: Camera, far: float, found: Float64
+) -> None:  # fmt: skip
     """Find where the rays of a pinhole camera first meet a sheet's surface from its front; nothing else is asked.
 
     ``depth`` (h, w) is NaN at what is no corner of ``surface`` (h-1, w-1), ``x`` (w,) and ``y`` (h,) are the rays of its grid,
     ``T`` (4, 4) maps its frame to the camera's. Points deeper than ``far`` there are no surface.
 
-    Returns (H, W) depth, NaN: no surface, and (H, W, 2) the place (u, v) on the grid.
+    ``found`` (H, W, 3) receives depth, infinite: no surface, and the place (u, v) on the grid.
     """
-    found = np.full((camera.height * camera.width, 6), np.inf)
+    found.fill(np.inf)
     eye = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    skirt = np.full(camera.height * camera.width, np.inf)
-    _render(
-        depth.astype(np.float64), np.ascontiguousarray(surface), x, y, T, far, eye, camera.shape, found, skirt
-    )
-    image = found.reshape(*camera.shape, 6)
-    return np.where(np.isfinite(image[..., 0]), image[..., 0], np.nan), image[..., 1:3]
+    z, cut, nowhere = depth.astype(np.float64), np.ascontiguousarray(surface), np.empty(0)
+    _render(z, cut, x, y, T, far, eye, camera.shape, found.reshape(-1, 3), nowhere)
 
 
 def _borders(
@@ -303,8 +299,10 @@ def _keep_nearest(
 ) -> None:
     """Keep a hit where it is the nearest of its pixel: depth, place on the grid, normal. NaN compares false."""
     if depth < out[pixel, 0]:
-        size = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
         out[pixel, 0], out[pixel, 1], out[pixel, 2] = depth, u, v
+        if out.shape[1] == 3:  # nobody asks for normals
+            return
+        size = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
         out[pixel, 3], out[pixel, 4], out[pixel, 5] = -normal[0] / size, -normal[1] / size, -normal[2] / size
 
 
@@ -332,12 +330,12 @@ def _trace(
             depth, _, wb, wc, front = _meet(bc, ca, ab, det_a, x, y)
             if surface and front:
                 _keep_nearest(depth, at[1] + wb, at[0] + wc, upper, pixel, out)
-            elif depth < skirt[pixel]:
+            elif len(skirt) and depth < skirt[pixel]:
                 skirt[pixel] = depth
             depth, wb, wc, wd, front = _meet(dc, bd, cb, det_d, x, y)
             if surface and front:
                 _keep_nearest(depth, at[1] + wb + wd, at[0] + wc + wd, lower, pixel, out)
-            elif depth < skirt[pixel]:
+            elif len(skirt) and depth < skirt[pixel]:
                 skirt[pixel] = depth
 
 
@@ -350,7 +348,7 @@ def _render(
 
     ``x`` and ``y`` are rays of the grid, ``pose`` maps its frame to that of the ``eye`` (fx, fy, cx, cy), whose image has
     ``size`` (H, W). ``out`` (H W, 6) receives depth, place on the grid (u, v), normal, ``skirt`` (H W,) depth; both start with
-    infinity.
+    infinity. ``out`` may be (H W, 3), without normals, ``skirt`` empty.
     """
     height, width = size
     p, q = np.empty((len(x), 3)), np.empty((len(x), 3))
@@ -359,6 +357,8 @@ def _render(
     for v in range(len(y) - 1):
         _points_of_row(z[v + 1], x, y[v + 1], pose, far, eye, q, t)
         for u in range(len(x) - 1):
+            if not (surface[v, u] or len(skirt)):
+                continue
             u0 = np.ceil(max(min(s[u, 0], s[u + 1, 0], t[u, 0], t[u + 1, 0]), 0.0))
             u1 = np.floor(min(max(s[u, 0], s[u + 1, 0], t[u, 0], t[u + 1, 0]), width - 1.0))
             v0 = np.ceil(max(min(s[u, 1], s[u + 1, 1], t[u, 1], t[u + 1, 1]), 0.0))
