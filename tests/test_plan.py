@@ -58,9 +58,9 @@ def test_every_view_sees_the_target(plan):
 
 
 def test_views_show_enough_of_an_object(plan):
-    """No view shows less than three quarters of what the best ones do; without regard to it some would."""
+    """No view shows less than 85 % of what the best ones do; without regard to it some would."""
     shares = np.array([v.coverage for v in plan.views])
-    assert shares.min() > 0.75 * shares.max()
+    assert shares.min() > 0.85 * shares.max()
     assert "% of an object" in plan.summary()
     blind = _plan(sampling=replace(object_sampling(), both=False)).views
     assert all(np.isnan(v.coverage) and v.spare is None for v in blind)
@@ -68,16 +68,20 @@ def test_views_show_enough_of_an_object(plan):
     assert expected(RIG, STAGE, poses).min() < 0.75 * shares.max()
 
 
-def test_each_view_has_another_place(plan):
-    """Nearly every view comes with another one, of its own number and turn, reachable, clear and no view of the plan."""
-    spares = [v.spare for v in plan.views if v.spare]
-    assert len(spares) > 20
-    assert not {v.digest for v in spares} & {v.digest for v in plan.views}
+def test_each_view_has_other_places(plan):
+    """Nearly every view comes with two more, of its own number and turn, reachable, clear and no view of the plan."""
+    first = [v.spare for v in plan.views if v.spare]
+    second = [v.spare for v in first if v.spare]
+    assert len(second) > 20
+    assert all(v.spare is None for v in second)
+    assert not {v.digest for v in first + second} & {v.digest for v in plan.views}
     for view in plan.views:
+        spare = view.spare
+        for digest in view.places[1:]:
+            assert (spare.digest, spare.index, spare.turn) == (digest, view.index, view.turn)
+            assert is_clear(UR10E, RIG, STAGE, HOME, spare.joints)
+            spare = spare.spare
         if view.spare:
-            assert (view.spare.index, view.spare.turn) == (view.index, view.turn)
-            assert view.places == [view.digest, view.spare.digest]
-            assert is_clear(UR10E, RIG, STAGE, HOME, view.spare.joints)
             assert view.as_json()["spare"]["joints"] == view.spare.joints.tolist()
 
 
@@ -132,10 +136,10 @@ def test_views_are_spread(plan):
     assert sorted(v.index for v in plan.views) == list(range(25))
     distances = np.array([v.distance for v in plan.views])
     tilt = np.degrees(np.arccos([v.direction[2] for v in plan.views]))
-    assert distances.min() < 0.45
-    assert distances.max() > 0.95
+    assert distances.min() < 0.6
+    assert distances.max() > 0.8
     assert np.sum((distances > 0.45) & (distances < 1.1)) >= 8
-    assert tilt.min() < 25
+    assert tilt.min() < 30
     assert tilt.max() > 50
     features = np.array([[*v.direction, 0.6 * np.log(v.distance)] for v in plan.views])
     gaps = np.linalg.norm(features[:, None] - features, axis=-1) + 10 * np.eye(25)
@@ -152,8 +156,8 @@ def test_same_generator_same_plan(plan):
 
 def test_a_plan_is_the_same_on_every_machine(plan):
     """The digests of a seed's plan, of one of its views, and of given joints, as written into recordings."""
-    assert plan.digest == "c3e27c8a558f0284"
-    assert plan.views[0].digest == "bbd831df5f2e803b"
+    assert plan.digest == "5afcf2e1f7fcbb0a"
+    assert plan.views[0].digest == "3b6ae58db056a0a4"
     view = replace(plan.views[0], joints=np.array([0.1, -1.2, 1.3, 0.0, 0.5, -0.0]), turn=0.0)
     assert view.digest == replace(view, joints=view.joints + 4e-7, distance=9.0).digest == "6ad404dbd3a45b3a"
     assert replace(view, turn=np.pi / 2).digest == "62e31b2e5c57eda3"

@@ -160,10 +160,15 @@ def _ground_truth(
     sheet: Sheet, planes: PlaneField, crop: Crop, rig: Rig, scale: int, far: float, surface: tuple[Surface, int] | None
 ) -> GroundTruth:  # fmt: skip
     camera = rig.tof.scaled(scale)
-    seen = project(sheet, rig.stereo, rig.T_tof_stereo, camera, edge_pixels=scale, far=far)
+    # A step marks one pixel on either side; from 2x on, those beside it make that one ToF pixel.
+    near = max(1, scale - 1)
+    seen = project(sheet, rig.stereo, rig.T_tof_stereo, camera, edge_pixels=near, far=far)
+    single = smoothed(seen, planes, rig, camera)
     if surface is None:
-        return masked(smoothed(seen, planes, rig, camera), rig, camera, crop)
-    seen, sigma, views = fused(*surface, rig, camera, smoothed(seen, planes, rig, camera), scale, far)
+        return masked(single, rig, camera, crop)
+    seen, sigma, views = fused(*surface, rig, camera, single, near, far)
+    if len(surface[0].members(surface[1])) == 1:
+        seen = single  # no other view says anything of it
     # The last of 24 bits are noise of no use, and would be most of what a shard stores of it.
     coarse = (sigma.astype(np.float32).view(np.uint32) & np.uint32(0xFFFF8000)).view(np.float32)
     return replace(masked(seen, rig, camera, crop, alone=np.abs(views) <= 1), sigma=coarse, views=views)

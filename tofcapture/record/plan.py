@@ -3,7 +3,7 @@
 A UR arm reaches far fewer views than one expects. The plan tries thousands of candidates and keeps those that are clear, at
 the goal and on the straight way from home, and from which both cameras see enough of an object (``record.sight``). It picks
 from them by greedy farthest-point sampling over direction and distance: 10 views are the first 10 of 25, so a recording can
-be extended. With a view comes another place, for an object of which it shows too little. A person may turn the object.
+be extended. With a view come other places, for an object of which it shows too little. A person may turn the object.
 
 Each view is held as its way from home and back allows: by the clearance model with room to spare, and by the checks of the arm
 itself. So the way by home is always there, and :func:`prove` shows it before anything moves.
@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -62,8 +63,10 @@ _WRIST_WEIGHTS = (0.5, 0.5, 0.25)  # of the last three joints in "close to home"
 _LOG_DISTANCE = 0.6  # rad per e-fold of distance: how much a nearer view counts against a turned one
 _FEW = 24  # candidates that each pick of the sampling chooses among
 _MOST_TURNS = 36
-_PLENTY = 10 * _FEW  # candidates from which on a view's other place is none of the views to come
-_WORTH = 0.85  # of what the best candidates show of an object: less is no view
+_PLENTY = 5 * _FEW  # candidates from which on a view's other places are none of the views to come
+_WORTH = 0.95  # of what the best candidates show of an object: less is no view
+_SPARES = 2  # other places of a view at most
+_FARTHER = _LOG_DISTANCE * float(np.log(1.4))  # one of a view's other places is that much farther away
 _ALIKE = 0.03  # of an object; rolls that show as much are chosen among by their nearness to home
 # m; more room than the checks before a motion ask for: an arm arrives within 0.02 deg, not exactly
 _AIR = 0.005
@@ -82,9 +85,8 @@ class PlannedView:
     coverage: float = float(
         "nan"
     )  # share of an object that is expected to have good ground truth; NaN: nobody asked
-    spare: PlannedView | None = (
-        None  # the same view from elsewhere, should the object be seen too little of here
-    )
+    # The same view from elsewhere, should too little of the object be seen from here.
+    spare: PlannedView | None = None
 
     @property
     def digest(self) -> str:
@@ -271,13 +273,13 @@ def plan_views(
         return PlannedView(i, q, forward(model, q), *place, share, spare)
 
     most = np.tile(shares, turns) if sampling.both else None
-    chosen = _spread(features, np.tile(refusal < 0, turns), views, accept, rng, most)
-    # The other place belongs to the same turn of the object.
-    spares = [None if other is None else k - k % count + other % count for k, other in chosen]
-    planned = [
-        view(i, k, None if spare is None else view(i, spare))
-        for i, ((k, _), spare) in enumerate(zip(chosen, spares, strict=True))
-    ]
+    planned = []
+    for i, (k, others) in enumerate(_spread(features, np.tile(refusal < 0, turns), views, accept, rng, most)):
+        spare = None
+        for other in reversed(others):
+            # It belongs to the same turn of the object.
+            spare = view(i, k - k % count + other % count, spare)
+        planned.append(view(i, k, spare))
     refused = {reason: int((refusal == i).sum()) for i, reason in enumerate(REFUSALS)}
     tried = Tried(target + distances[:, None] * directions, refusal)
     return Plan(tuple(_by_travel(planned, workcell.home)), views, count, refused, tried)
@@ -458,16 +460,16 @@ def _spread(
     accept: Callable[[int], bool],
     rng: np.random.Generator,
     shares: Float64 | None,
-) -> list[tuple[int, int | None]]:
+) -> list[tuple[int, list[int]]]:
     """Pick by farthest-point sampling: greedy, so that fewer views are a prefix of more.
 
     Every pick is the farthest of a few random candidates (Mitchell's best candidate). The farthest of all would put nearly
-    every view on the rim of what the arm reaches. Where ``shares`` (C,) tell what candidates show, the one that shows most
-    of the farther half of those few comes with it.
+    every view on the rim of what the arm reaches. Where ``shares`` (C,) tell what candidates show, two others of
+    the farther half of those few come with it: that which shows most from a larger distance, and the most different one.
     """
     left = np.flatnonzero(usable)
     gap = np.full(len(features), np.inf)
-    chosen: list[tuple[int, int | None]] = []
+    chosen: list[tuple[int, list[int]]] = []
     while len(left) and len(chosen) < views:
         few = rng.choice(left, size=min(_FEW, len(left)), replace=False)
         few = few[np.argsort(-gap[few], kind="stable")]
@@ -475,15 +477,21 @@ def _spread(
         left = left[left != k]
         if not accept(k):
             continue
-        other = None
+        others: list[int] = []
         if shares is not None:
-            others = few[1 : _FEW // 2]
-            others = others[np.argsort(-shares[others], kind="stable")]
-            other = next((int(n) for n in others if accept(int(n))), None)
+            half = few[1 : _FEW // 2]
+            half = half[np.argsort(-shares[half], kind="stable")]
+            # What is too large for the images is seen whole from farther away.
+            farther = features[half, 3] > features[k, 3] + _FARTHER
+            others = list(islice((int(n) for n in half[farther] if accept(int(n))), 1))
+            # What one side hides, another shows.
+            apart = np.linalg.norm(features[half] - features[k], axis=1)
+            rest = [int(n) for n in half[np.argsort(-apart, kind="stable")] if n not in others]
+            others += islice((n for n in rest if accept(n)), _SPARES - len(others))
             # Of few candidates none can be spared.
             if len(left) > _PLENTY:
-                left = left[left != (k if other is None else other)]
-        chosen.append((k, other))
+                left = left[~np.isin(left, others)]
+        chosen.append((k, others))
         gap = np.minimum(gap, np.linalg.norm(features - features[k], axis=1))
     return chosen
 

@@ -9,7 +9,7 @@ Every check is one number and a limit (:data:`LIMITS`). What is done about it de
 ``refuse``
     The data are not of this pose, or not there: taken again, three times in all, then the view is given up.
 ``elsewhere``
-    The object hides too much from here: taken from the view's other place as well, once; the better one is kept.
+    The object hides too much from here: taken from the view's other places as well, until one is good; the best is kept.
 
 Of board views it also says what they cover so far, told from the arm's poses and where the station says the board is. Nothing is
 detected; ``tofcapture calibrate coverage`` says more afterwards.
@@ -101,7 +101,7 @@ LIMITS = (
     Limit("out_of_reach", 0.5, REFUSE, "{0:.0%} of the scene lies where the ToF frequencies cannot tell its distance", _REACH),
     Limit("frame_drops", 0, RETAKE, "{0:.0f} frames were dropped within the burst", _LINK),
     Limit("flicker", 0.03, RETAKE, "the light changed by {0:.1%} between the frames", "keep people and lamps out of sight; shade the sun"),
-    Limit("object_coverage", 0.55, ELSEWHERE, "both cameras see {0:.0%} of the object well", "come nearer, or see it more from aside", least=True),
+    Limit("object_coverage", 0.70, ELSEWHERE, "both cameras see {0:.0%} of the object well", "come nearer, or see it more from aside", least=True),
     Limit("saturated", 0.05, NOTE, "{0:.0%} of the ToF pixels are saturated", "shorten the exposure; dull what shines"),
     Limit("offset", 0.08, NOTE, "the frequencies' ranges differ by {offset_m:.3f} m, {0:.0%} of what another wrap makes", _OFFSET),
     Limit("dark", 0.5, NOTE, "{0:.0%} of the ToF pixels are too dark for 20 mm", _DULL),

@@ -202,31 +202,31 @@ class _Run:
             view = self.attempts(planned)
         except DeviceError as err:
             return self.give_up(planned.index, err)
-        reason = ""
-        if planned.spare is not None and _lacking(view):
-            view, reason = self.from_elsewhere(view, planned.spare)
-        self.notes += [
-            f"view {planned.index}: {note['words']}" for note in view.provenance["quality"]["notes"]
-        ]
-        return self.seal(view, reason)
+        spare = planned.spare
+        while spare is not None and _lacking(view):
+            view, spare = self.from_elsewhere(view, spare), spare.spare
+        notes = view.provenance["quality"]["notes"]
+        self.notes += [f"view {planned.index}: {note['words']}" for note in notes]
+        moved = view.provenance["pose"] != planned.digest
+        return self.seal(view, next(n["words"] for n in notes if n["action"] == ELSEWHERE) if moved else "")
 
-    def from_elsewhere(self, view: View, spare: PlannedView) -> tuple[View, str]:
-        """Take a view that shows too little of its object from its other place too; the better one, and why if that is the other."""
+    def from_elsewhere(self, view: View, spare: PlannedView) -> View:
+        """Take a view that shows too little of its object from another place too; return the better one, with a note on both."""
         quality = view.provenance["quality"]
         words = next(note["words"] for note in quality["notes"] if note["action"] == ELSEWHERE)
         try:
             other = self.attempts(spare)
         except DeviceError as err:
             self.stop.check()
-            words, better = f"{words}; not taken from its other place: {err.message}", view
+            words, better = f"{words}; not taken from another place: {err.message}", view
         else:
             there = other.provenance["quality"].get("object_coverage", 0.0)
             better = other if there > quality["object_coverage"] else view
-            words = f"{words}, {there:.0%} from its other place, which is {'kept' if better is other else 'no better'}"
+            words = f"{words}, {there:.0%} from another place, which is {'kept' if better is other else 'no better'}"
         notes = better.provenance["quality"]["notes"]
         notes[:] = [n for n in notes if n["check"] != "object_coverage"]
         notes.append({"check": "object_coverage", "action": ELSEWHERE, "words": words})
-        return better, words if better is not view else ""
+        return better
 
     def attempts(self, planned: PlannedView) -> View:
         """Move, expose and judge, in three attempts at most; raises :class:`DeviceError` when the last one failed."""
@@ -370,4 +370,4 @@ class _Run:
 
 def _lacking(view: View) -> bool:
     """Whether a view shows so little of its object that it is worth a look from elsewhere."""
-    return any(note["action"] == ELSEWHERE for note in view.provenance["quality"]["notes"])
+    return any(limit.action == ELSEWHERE for limit in broken_limits(view.provenance["quality"]))

@@ -24,12 +24,12 @@ from tofcapture.rig import Rig
 Bools = NDArray[np.bool_]
 
 _AROUND = 5  # cans about the one at the target; what stands off the middle counts as much as it
-_SPREAD = 0.45  # of the keep-out's radius: how far off they stand
+_SPREAD = 0.55  # of the keep-out's radius: how far off they stand
 _SLIM = 0.5  # of a can's height: its radius
 _LOWEST = 0.03  # m; lower things are as good as flat
 _SIDES, _RINGS = 12, 2  # points of a can's wall
 _STEEPEST = np.cos(np.radians(78.0))  # what stereo sees from more aside it loses
-_RIM = 2.3  # pixels of the ToF image along its outline that a thing loses: marked edges
+_RIM = 1.8  # pixels of the ToF image along its outline that a thing loses: marked edges
 _CHUNK = 400  # poses at a time
 _CLEAR = 0.004  # m above the table: the nearest of the points in a pixel is none of the table's
 _TOF_CLEAR = 0.02  # m above the table that no light from several ways makes a ToF camera err
@@ -185,6 +185,9 @@ def covered(depth: NDArray[np.float32], points: Float64, camera: Camera, T_base_
     thing, hidden = stands(seen, _CLEAR), ~there & stands(depth, _TOF_CLEAR)
     if thing.sum() + hidden.sum() < _FEWEST:
         return float("nan")
-    near, far = minimum_filter(np.where(there, seen, -1), 3), maximum_filter(seen, 3)
-    good = thing & (near > 0) & (far - near < STEEPEST / camera.fx * near)
+    around = minimum_filter(there.view(np.uint8), 3) > 0
+    beside = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=bool)
+    near, far = minimum_filter(seen, footprint=beside), maximum_filter(seen, footprint=beside)
+    # Steps as small as those between the pixels of 2x, on which the truth is judged.
+    good = thing & around & (np.maximum(far - seen, seen - near) < STEEPEST / (2 * camera.fx) * seen)
     return float(good.sum() / (thing.sum() + hidden.sum()))
