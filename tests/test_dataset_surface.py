@@ -20,6 +20,7 @@ from tofcapture.files.layout import MaskBit
 from tofcapture.files.shard import ShardReader
 from tofcapture.files.view import view_path, write_view
 from tofcapture.frames import ArmState, View
+from tofcapture.ops.fuse import Clouds, Hits, fuse
 from tofcapture.ops.register import OWN, _repeats
 from tofcapture.poses import exp, invert, look_at
 from tofcapture.rig import dumps_rig
@@ -206,3 +207,19 @@ def test_what_cannot_be_fused_is_single(views, tmp_path, some, why):
     with ShardReader(tmp_path / "out/shards/mug.h5") as a, ShardReader(alone.dataset / "shards/mug.h5") as b:
         np.testing.assert_array_equal(a.ground_truth(0, 2).depth, b.ground_truth(0, 2).depth)
         np.testing.assert_array_equal(a.ground_truth(0, 2).mask, b.ground_truth(0, 2).mask)
+
+
+def test_what_the_own_camera_is_sure_of_is_not_outvoted_in_silence():
+    """Two views see past a surface that the target's own camera is sure of: their depth there is doubtful, not where all agree."""
+    planes = np.full((3, 8, 8, 5), [0, 0, 2, 1e-4, 5e-5], dtype=np.float32)
+    free = np.full((3, 8, 8), 0.7, dtype=np.float32)
+    quads, boxes = np.zeros((3, 7, 7), dtype=np.uint8), np.zeros((3, 4), dtype=np.intp)
+    hits = Hits.none(3, 2)
+    hits.depth[:], hits.cell[:] = [[0.5, 0.6], [0.6, 0.6], [0.6, 0.6]], 0
+    hits.sigma[:], hits.noise[:] = 1e-4, 1e-4
+    clouds, rays = Clouds(free, quads, planes, free, boxes), np.array([[0.0, 0, 1], [0, 0, 1]])
+    poses, eye = np.tile(np.eye(4), (3, 1, 1)), np.array([16.0, 16, 8, 8])
+    known = np.zeros(2), np.ones(2, dtype=bool)
+    found = fuse(hits, np.arange(3), 0, clouds, poses, eye, rays, np.zeros((3, 6, 3, 6)), *known, 2)
+    assert found.depth == pytest.approx(0.6)
+    assert found.doubtful.tolist() == [True, False]

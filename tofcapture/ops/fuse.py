@@ -276,6 +276,7 @@ def _fuse(
             for k in range(3):
                 along += rays[i, k] * (poses[j, k, 0] * p + poses[j, k, 1] * q + poses[j, k, 2] * r)
             slope[j] = max(along / size, LEAST_SLOPE)
+        outvoted = False
         for first in range(found):
             begin = order[first]
             members, sure, behind = 0, 0, 0
@@ -294,6 +295,7 @@ def _fuse(
                 for j in members_of:
                     past += _free(free, j, place[0, j], place[1, j], place[2, j]) > PAST
             if past > members:
+                outvoted |= begin == own and sigma[own, i] > 0  # its camera was sure: who is right?
                 continue
             used = 0
             for a in range(found):
@@ -327,7 +329,7 @@ def _fuse(
             off_normal = _unplaced(J, off, kept, used, weight, M) + FLOOR**2 + bent**2
             deviation[i] = np.sqrt(beyond * left + beyond * off_normal / steepest**2)
             views[i] = views[i] if has_own else -views[i]
-            doubtful[i] = sure == 0 or behind > sure or deviation[i] > UNSURE
+            doubtful[i] = outvoted or sure == 0 or behind > sure or deviation[i] > UNSURE
             z = out[i] - CLEAR
             while z > near[i] and not (has_own and clear[i]):
                 empty = _empty(free, into, way, last, z)
