@@ -11,13 +11,13 @@ from torch.nn import functional as F  # noqa: N812
 from tofcapture_model.geometry.maps import shifted
 
 
-def double_conv(inputs: int, outputs: int) -> nn.Sequential:
-    """Make two 3 x 3 convolutions with ReLU."""
+def double_conv(inputs: int, outputs: int, leak: float = 0.0) -> nn.Sequential:
+    """Make two 3 x 3 convolutions with ReLU, or one that lets a share of what is negative through."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, padding=1),
-        nn.ReLU(inplace=True),
+        nn.LeakyReLU(leak, inplace=True),
         nn.Conv2d(outputs, outputs, 3, padding=1),
-        nn.ReLU(inplace=True),
+        nn.LeakyReLU(leak, inplace=True),
     )
 
 
@@ -39,15 +39,22 @@ class UNet(nn.Module):
     """
 
     def __init__(
-        self, inputs: int, outputs: int, width: int = 64, levels: int = 5, *, zero_last: bool = False
+        self,
+        inputs: int,
+        outputs: int,
+        width: int = 64,
+        levels: int = 5,
+        *,
+        zero_last: bool = False,
+        leak: float = 0.0,
     ) -> None:
         super().__init__()
         widths = [width * 2**i for i in range(levels)]
         self.down = nn.ModuleList(
-            double_conv(a, b) for a, b in zip([inputs, *widths[:-1]], widths, strict=True)
+            double_conv(a, b, leak) for a, b in zip([inputs, *widths[:-1]], widths, strict=True)
         )
         self.up = nn.ModuleList(nn.ConvTranspose2d(2 * w, w, 2, stride=2) for w in widths[-2::-1])
-        self.merge = nn.ModuleList(double_conv(2 * w, w) for w in widths[-2::-1])
+        self.merge = nn.ModuleList(double_conv(2 * w, w, leak) for w in widths[-2::-1])
         self.last = nn.Conv2d(width, outputs, 1)
         self.multiple = 2 ** (levels - 1)
         self.apply(he_initialised)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from tofcapture.cli.kit import Report
 from tofcapture.files.manifest import load_manifest
@@ -42,6 +42,8 @@ WARM_UP = 0.02  # of a stage, with a cosine schedule
 MAX_NORM = 1.0  # of the gradient
 _UNCALIBRATED = 0.15  # share of frames of a camera that nobody calibrated
 _UNCALIBRATED_RAD = (0.01, 0.1)  # its error, from a sine's to a square wave's
+_CONVOLUTION = 4  # axes of its weight
+_FULL_PACE = 288  # inputs: two maps of compact's width under 3 x 3 weights
 _REMEMBERED = 300  # samples whose values a network remembers as familiar
 
 
@@ -150,7 +152,8 @@ class Learner:
     ) -> None:
         self.training, self.stage, self.group = config.training, stage, group
         self.parameters = select_stage(model, stage.name)
-        self.optimizer = torch.optim.Adam(self.parameters, lr=stage.learning_rate)
+        groups = [{"params": [p], "pace": _pace(model, p)} for p in self.parameters]
+        self.optimizer = torch.optim.Adam(groups, lr=stage.learning_rate)
         self._names = {id(p): n for n, p in model.named_parameters()}
         self._network = nn.parallel.DistributedDataParallel(model) if group.world > 1 else model
         for parameter in self.parameters:
@@ -193,12 +196,22 @@ class Learner:
     def step(self, rate: float) -> None:
         """Follow the gradient."""
         for parameters in self.optimizer.param_groups:
-            parameters["lr"] = rate
+            parameters["lr"] = rate * parameters["pace"]
         self.optimizer.step()
 
     def moments(self) -> Moments:
         """Return Adam's moments by the parameter's name."""
         return {self._names[id(p)]: values for p, values in self.optimizer.state.items()}
+
+
+def _pace(model: Model, parameter: Tensor) -> float:
+    """Tell by how much slower a weight learns: Adam moves all by as much, and the sum of many should not move by more.
+
+    As Yang and Hu (2021) derive it, by the inverse of how many inputs are summed. The published networks have one rate, as published.
+    """
+    if not isinstance(model, CompactModel) or parameter.ndim < _CONVOLUTION:
+        return 1.0
+    return min(1.0, _FULL_PACE / parameter[0].numel())
 
 
 def scheduled_rate(stage: Stage, schedule: str, progress: float) -> float:
