@@ -37,6 +37,15 @@ def test_the_bundled_network_is_the_preset_compact_and_finite():
     assert provenance["steps"] > 1000
 
 
+def test_no_level_of_it_is_dead():
+    """Every weight answers for something: one whose units never rise above zero takes time and does nothing, as all levels but one once did."""
+    model = load_checkpoint(None)[0]
+    found = model(example(1))
+    (found.depth.sum() + found.normals[:, 0].sum() + found.error.sum()).backward()
+    dead = [n for n, p in model.named_parameters() if p.numel() and (p.grad is None or not p.grad.any())]
+    assert not dead
+
+
 def test_the_card_names_the_data_that_the_weights_remember():
     """Digest of the manifest, steps and the factor of the uncertainty stand in the card as in the file."""
     provenance = load_checkpoint(None)[2]

@@ -37,6 +37,43 @@ def small(rank=0, **training):
     return learner
 
 
+def test_weights_that_no_gradient_reaches_are_named():
+    """A layer all of whose units are below zero stops learning, and all before it: nobody would know from the loss."""
+    learner, data = small(), frame(12, 16, batch=1)
+    config = preset("demo")
+    alive = {n for n, p in learner.model.named_parameters() if p.requires_grad}
+    for p in learner.model.parameters():
+        torch.nn.init.normal_(p, std=0.1)  # heads begin at zero, and what is before them without a gradient
+    for dies in (False, True):
+        if dies:
+            learner.model.raw2normal.net[0].bias.data.fill_(-1e6)
+        estimate = learner.forward(data)
+        loss = training_loss(
+            learner.model, replace(config.losses, chamfer=0.0), "joint", estimate, target(data), data
+        )
+        learner.backward(loss)
+        idle = set(learner.idle())
+        assert idle < alive
+        assert ("raw2normal.net.0.weight" in idle) == dies
+
+
+def test_weights_of_many_inputs_learn_slower():
+    """By the inverse of what is summed; biases, small layers and the published networks at the full rate."""
+    config = preset("compact")
+    model = build_model(config)
+    learner = Learner(model, config, config.stages[0], Group(0, 1, torch.device("cpu")))
+    before = {n: p.detach().clone() for n, p in model.named_parameters()}
+    for p in model.parameters():
+        p.grad = torch.ones_like(p)
+    learner.step(1e-3)
+    moved = {
+        n: float((p.detach() - before[n]).abs().mean()) for n, p in model.named_parameters() if p.numel()
+    }
+    assert moved["backbone.down.4.2.weight"] == pytest.approx(1e-3 / 8, rel=0.01)
+    assert moved["backbone.down.4.2.bias"] == pytest.approx(1e-3, rel=0.01)
+    assert moved["backbone.merge.3.2.weight"] == pytest.approx(1e-3, rel=0.01)
+
+
 BURST = torch.tensor([BurstNoise(4, 16.0, 1.25, 4095.0)])
 
 

@@ -84,6 +84,8 @@ def _about(config: Config, model: Model, known: Mapping[str, Any]) -> str:
         rows.append(
             ("error map", f"times {fitted['factor']:.3g}, fitted on {_count(fitted['views'], 'view')}")
         )
+    if idle := known.get("idle"):
+        rows.append(("**learned nothing at the end**", f"{_count(len(idle), 'weight')}, as `{idle[0]}`"))
     return _table(("", ""), rows)
 
 

@@ -139,7 +139,7 @@ def train(
             if isinstance(model, CompactModel):
                 _remember(model, data, group.device)
         if group.rank == 0:
-            _finish(run, source)
+            _finish(run, {**source, "idle": learner.idle()})
             run.save_now_and_then(learner.moments(), now=True)
         return run.ended()
 
@@ -198,6 +198,11 @@ class Learner:
         for parameters in self.optimizer.param_groups:
             parameters["lr"] = rate * parameters["pace"]
         self.optimizer.step()
+
+    def idle(self) -> list[str]:
+        """Name the weights of the stage that no gradient reached in the last step: a layer whose units died learns nothing more."""
+        still = [p for p in self.parameters if p.grad is None or not bool(p.grad.any())]
+        return [self._names[id(p)] for p in still]
 
     def moments(self) -> Moments:
         """Return Adam's moments by the parameter's name."""
