@@ -47,6 +47,9 @@ class Network:
     levels: int = 5  #: of every U-Net
     inputs: tuple[str, ...] = ("raw", "confidence", "depth")  #: of the paper's networks (table IV)
     windows: tuple[int, ...] = (2, 4)  #: radii, px, of the side-window plane fits that compact reads
+    leak: float = (
+        0.0  #: share of what is negative that a unit of compact's U-Net lets through; with none units die
+    )
     max_residual: float = 0.0  #: m that a depth may move beyond its candidates; 0: any distance
     learned_upsampling: bool = True  #: of depth, convex x2; false: bilinear
     refine_iterations: int = 2  #: rounds of depth to normals to depth
@@ -63,6 +66,7 @@ class Network:
         _require(fine, "network.inputs", "all of them for compact", self.inputs)
         fine = all(w > 0 for w in self.windows) and (len(self.windows) > 0 or not compact)
         _require(fine, "network.windows", "positive radii, for compact one at least", self.windows)
+        _require(0 <= self.leak < 1, "network.leak", "from 0 to less than 1", self.leak)
         _require(self.max_residual >= 0, "network.max_residual", "metres >= 0", self.max_residual)
         refine = (self.refine_iterations, self.refine_radius)
         _require(min(*refine, 0) == 0 < refine[1], "network.refine", "iterations >= 0, radius > 0", refine)

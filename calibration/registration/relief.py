@@ -85,7 +85,9 @@ class Relief:
             eye = Camera(width, height, *focal.tolist(), *(-low * focal).tolist())
         x, y = np.ascontiguousarray(g.rays[0, :, 0]), np.ascontiguousarray(g.rays[:, 0, 1])
         T = invert(T_base_tof) @ self.T_base_stereo[k]
-        z, _ = place_hits(sheet.depth.astype(np.float32), sheet.surface, x, y, T, eye, FAR)
+        found = np.empty((*eye.shape, 3))
+        place_hits(sheet.depth.astype(np.float32), sheet.surface, x, y, T, eye, FAR, found)
+        z = np.where(np.isfinite(found[..., 0]), found[..., 0], np.nan)
         if z.shape != rays.shape[:2]:
             u, v = np.rint(eye.project(rays)[0]).astype(np.intp).transpose(2, 0, 1)
             z = z[v, u]

@@ -22,9 +22,6 @@ from tofcapture_model.networks.heads import (
 )
 from tofcapture_model.networks.unet import CONVEX_CHANNELS, UNet
 
-# of compact's backbone: with none, all levels below the first died in training, and nothing told it
-LEAK = 0.1
-
 
 class JointModel(nn.Module):
     """Joint depth and normal estimation (paper section IV); :class:`PaperModel` and :class:`CompactModel` have the parts."""
@@ -87,7 +84,7 @@ class CompactModel(JointModel):
         super().__init__()
         self.inputs, width = CompactInputs(network.windows), network.width
         candidates = len(network.windows) + CORRECTIONS
-        self.backbone = UNet(self.inputs.channels, width, width, network.levels, leak=LEAK)
+        self.backbone = UNet(self.inputs.channels, width, width, network.levels, leak=network.leak)
         depth_net = zeroed_conv(width, candidates + 1 + CONVEX_CHANNELS)
         self.raw2depth = Raw2Depth(depth_net, network, candidates=candidates)
         self.error_map = ErrorMap(zeroed_conv(width + 4, 4))
