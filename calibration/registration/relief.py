@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.registration.clouds import Mask
 from calibration.registration.steps import FINE, Steps
 from tofcapture.camera import Camera
-from tofcapture.ops.project import Sheet, place_hits
+from tofcapture.ops.project import RayCast, Sheet
 from tofcapture.poses import Float64, invert, transform_points
 
 FAR = 3.0  # m
@@ -20,7 +20,6 @@ PAST = 0.004  # m; a view sees past a point that is so much nearer than what it 
 EMPTY = 0.002  # m; the same beside a rim
 BESIDE = (0.35, 0.8)  # px beside a rim, and
 BEHIND = (-0.004, 0.0, 0.012)  # m behind its front, that must be seen empty
-LENS_FINER = 2  # times as fine a pinhole image is what a lens is looked up in
 
 
 @dataclass(frozen=True)
@@ -41,9 +40,13 @@ class Relief:
         The nearest surface counts that no more views see past than agree on.
         """
         fine = tof.scaled(FINE)
-        hits = np.stack([self._met(k, fine, T_base_tof) for k in range(len(self.sheets))]).reshape(
-            len(self.sheets), -1
-        )
+        cast, T_tof_base = RayCast(fine, fine.rays), invert(T_base_tof)
+        x, y = (np.ascontiguousarray(r) for r in (self.camera.rays[0, :, 0], self.camera.rays[:, 0, 1]))
+        hits = np.empty((len(self.sheets), fine.width * fine.height), dtype=np.float32)
+        for k, sheet in enumerate(self.sheets):
+            T = T_tof_base @ self.T_base_stereo[k]
+            depth = cast.met(sheet.depth, sheet.surface, x, y, T, FAR)[..., 0]
+            hits[k] = np.where(np.isfinite(depth), depth, np.nan).ravel()
         count = np.isfinite(hits).sum(axis=0)
         nearest, farthest = np.fmin.reduce(hits), np.fmax.reduce(hits)
         sure = (count > 1) & (farthest - nearest < SAME)
@@ -74,24 +77,6 @@ class Relief:
                     seen |= there > z + EMPTY
                 out &= seen
         return out
-
-    def _met(self, k: int, eye: Camera, T_base_tof: Float64) -> NDArray[np.float32]:
-        """Depth (H, W) of one view's surface in an image; a lens's rays are those of the nearest finer pixels of a pinhole."""
-        g, sheet, rays = self.camera, self.sheets[k], eye.rays
-        if eye.distortion:
-            low, high = rays[..., :2].min(axis=(0, 1)), rays[..., :2].max(axis=(0, 1))
-            focal = LENS_FINER * np.array([eye.fx, eye.fy])
-            width, height = (np.rint((high - low) * focal).astype(int) + 1).tolist()
-            eye = Camera(width, height, *focal.tolist(), *(-low * focal).tolist())
-        x, y = np.ascontiguousarray(g.rays[0, :, 0]), np.ascontiguousarray(g.rays[:, 0, 1])
-        T = invert(T_base_tof) @ self.T_base_stereo[k]
-        found = np.empty((*eye.shape, 3))
-        place_hits(sheet.depth.astype(np.float32), sheet.surface, x, y, T, eye, FAR, found)
-        z = np.where(np.isfinite(found[..., 0]), found[..., 0], np.nan)
-        if z.shape != rays.shape[:2]:
-            u, v = np.rint(eye.project(rays)[0]).astype(np.intp).transpose(2, 0, 1)
-            z = z[v, u]
-        return z.astype(np.float32)
 
     def _views_past(self, points: Float64) -> NDArray[np.intp]:
         """How many views see past points (N, 3), base frame, all about them."""

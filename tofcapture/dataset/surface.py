@@ -22,7 +22,7 @@ from tofcapture.ops.crop import WHOLE, Crop, crop_depth, find_crop
 from tofcapture.ops.denoise import denoise
 from tofcapture.ops.fuse import INNER, SURFACE, TARGET, Clouds, Hits, fuse, meet
 from tofcapture.ops.normals import RADII, PlaneField, alike_pixels
-from tofcapture.ops.project import Projection, Sheet, edges, place_hits, triangulate
+from tofcapture.ops.project import Projection, RayCast, Sheet, edges, triangulate
 from tofcapture.ops.register import Samples, register
 from tofcapture.pool import Pool
 from tofcapture.poses import Float64, adjoint, invert, rotate_vectors, transform_points
@@ -33,7 +33,6 @@ BORDER = 2  # cells from where the surface is cut, in which matches mix both sid
 MARGIN = 12  # cells about the object
 ABOUT = 0.02  # m, about the object, that are fused with it
 PLACES = 600, 300  # sampled planes of the object and of what is about it
-LENS_FINER = 3  # times as fine a pinhole image is what a lens is looked up in
 APART = "it does not see what the others see: the object moved, or its pose is wrong"
 PLANE = 3  # numbers that a plane has
 
@@ -316,7 +315,7 @@ def fused(
     sigma, views = np.full(camera.shape, np.nan), np.zeros(camera.shape, dtype=np.int8)
     window = np.s_[:, :] if len(members) == 1 else _window(surface, own, rig, camera)
     part = np.array(rays[window], order="C").reshape(-1, 3)
-    look = _Window(camera, rays[window])
+    cast = RayCast(camera, rays[window])
     hits = Hits.none(len(T_tof_stereo), len(part))
     off = surface.relative(own, rig.T_tof_stereo)
     for k in members.tolist():
@@ -327,13 +326,13 @@ def fused(
         elif top < bottom:
             box = np.s_[top:bottom, left:right]
             cut = (clouds.quads[k, top : bottom - 1, left : right - 1] & SURFACE) > 0
-            met = look.met(clouds.depth[k][box], cut, x[left:right], y[top:bottom], T_tof_stereo[k], far)
+            met = cast.met(clouds.depth[k][box], cut, x[left:right], y[top:bottom], T_tof_stereo[k], far)
         else:
             continue
         meet(hits, k, met.reshape(-1, 3), (top, left), clouds, T_tof_stereo[k], part, off[k, :, k])
     near, clear = _entry(surface, own, rig, part), ~seen.occluded[window].ravel()
-    found = fuse(hits, members, own, clouds, T_tof_stereo, eye, part, off, near, clear, look.shape[1])
-    shape, more = look.shape, found.others.reshape(look.shape)
+    found = fuse(hits, members, own, clouds, T_tof_stereo, eye, part, off, near, clear, cast.shape[1])
+    shape, more = cast.shape, found.others.reshape(cast.shape)
     others[window] = more
     depth[window] = np.where(more, found.depth.reshape(shape), depth[window])
     normals[window] = np.where(more[..., None], found.normals.reshape(*shape, 3), normals[window])
@@ -370,24 +369,3 @@ def _entry(surface: Surface, own: int, rig: Rig, rays: Float64) -> Float64:
         way = 1 / rotate_vectors(T_base_tof, rays)
         walls = np.minimum(low * way, high * way)
     return np.asarray(np.maximum(np.maximum(walls[:, 0], walls[:, 1]), walls[:, 2]))
-
-
-class _Window:
-    """Look up what the rays (H, W, 3) of a window of an image meet; a lens's are those of the nearest finer pixels."""
-
-    def __init__(self, camera: Camera, rays: Float64) -> None:
-        finer = LENS_FINER if camera.distortion else 1
-        low, high = (f(rays[..., :2].reshape(-1, 2).T.copy(), axis=1) for f in (np.min, np.max))
-        focal = finer * np.array([camera.fx, camera.fy])
-        width, height = (np.rint((high - low) * focal).astype(int) + 1).tolist()
-        self._eye = Camera(width, height, *focal.tolist(), *(-low * focal).tolist())
-        self._at = None if finer == 1 else np.rint(self._eye.project(rays)[0]).astype(np.intp)
-        self._found = np.empty((height, width, 3))
-        self.shape: tuple[int, int] = rays.shape[:2]
-
-    def met(
-        self, depth: NDArray[np.float32], cut: NDArray[np.bool_], x: Float64, y: Float64, T: Float64, far: float
-    ) -> Float64:  # fmt: skip
-        """Find (H, W, 3) where the rays meet one view's surface, as :func:`place_hits` does; the next call overwrites it."""
-        place_hits(depth, cut, x, y, T, self._eye, far, self._found)
-        return self._found if self._at is None else self._found[self._at[..., 1], self._at[..., 0]]

@@ -89,7 +89,7 @@ def meet(
     """Put into ``hits`` what the target's rays (P, 3) meet of one view.
 
     ``met`` (P, 3), depth and place in cells, the first of them in row and column ``corner`` of the view's, is what
-    :func:`tofcapture.ops.project.place_hits` found. ``off`` (6, 6) is the covariance of the view's pose as a twist in the target's frame.
+    :meth:`tofcapture.ops.project.RayCast.met` found. ``off`` (6, 6) is the covariance of the view's pose as a twist in the target's frame.
     """
     _meet(
         met, *corner, clouds.planes[view], clouds.quads[view], T_target_stereo, rays, off,

@@ -29,7 +29,8 @@ STEEPEST = 5.67  # tan 80 deg: neighbours further apart in depth are not one sur
 FILLED_GAP = 4  # pixels; a hole that is not wider, in a smooth surface, is interpolated
 NEARER = 0.95  # things are at most this much nearer than the nearest that is measured
 STEPS = 6  # places along a ray that must lie in the common view
-LENS_FINER = 2  # times as fine a pinhole image is what a lens is looked up in
+LENS_FINER = 2  # times as fine a pinhole image is what a lens is looked up in, and
+NEAREST_FINER = 3  # where the nearest of its pixels is the answer
 HIDES = 0.002  # m, and relative; a skirt hides the sheet when it is nearer by both
 
 
@@ -167,20 +168,34 @@ def project(
     )
 
 
-def place_hits(
-    depth: NDArray[np.floating], surface: Bool, x: Float64, y: Float64, T: Float64, camera: Camera, far: float, found: Float64
-) -> None:  # fmt: skip
-    """Find where the rays of a pinhole camera first meet a sheet's surface from its front; nothing else is asked.
+class RayCast:
+    """Cast the rays (H, W, 3) of a window of a camera's image at sheets; a lens's are those of the nearest finer pixels."""
 
-    ``depth`` (h, w) is NaN at what is no corner of ``surface`` (h-1, w-1), ``x`` (w,) and ``y`` (h,) are the rays of its grid,
-    ``T`` (4, 4) maps its frame to the camera's. Points deeper than ``far`` there are no surface.
+    def __init__(self, camera: Camera, rays: Float64) -> None:
+        finer = NEAREST_FINER if camera.distortion else 1
+        low, high = (f(rays[..., :2].reshape(-1, 2).T.copy(), axis=1) for f in (np.min, np.max))
+        focal = finer * np.array([camera.fx, camera.fy])
+        width, height = (np.rint((high - low) * focal).astype(int) + 1).tolist()
+        self._eye = Camera(width, height, *focal.tolist(), *(-low * focal).tolist())
+        self._at = None if finer == 1 else np.rint(self._eye.project(rays)[0]).astype(np.intp)
+        self._found = np.empty((height, width, 3))
+        self.shape: tuple[int, int] = rays.shape[:2]
 
-    ``found`` (H, W, 3) receives depth, infinite: no surface, and the place (u, v) on the grid.
-    """
-    found.fill(np.inf)
-    eye = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    z, cut, nowhere = depth.astype(np.float64), np.ascontiguousarray(surface), np.empty(0)
-    _render(z, cut, x, y, T, far, eye, camera.shape, found.reshape(-1, 3), nowhere)
+    def met(
+        self, depth: NDArray[np.floating], surface: Bool, x: Float64, y: Float64, T: Float64, far: float
+    ) -> Float64:
+        """Find where the rays first meet a sheet's surface from its front; nothing else is asked.
+
+        ``depth`` (h, w) is NaN at what is no corner of ``surface`` (h-1, w-1), ``x`` (w,) and ``y`` (h,) are the rays of its grid,
+        ``T`` (4, 4) maps its frame to the camera's. Points deeper than ``far`` there are no surface.
+
+        Returns (H, W, 3) depth, infinite: no surface, and the place (u, v) on the grid; the next call may overwrite it.
+        """
+        self._found.fill(np.inf)
+        eye = np.array([self._eye.fx, self._eye.fy, self._eye.cx, self._eye.cy])
+        z, cut, nowhere = depth.astype(np.float64), np.ascontiguousarray(surface), np.empty(0)
+        _render(z, cut, x, y, T, far, eye, self._eye.shape, self._found.reshape(-1, 3), nowhere)
+        return self._found if self._at is None else self._found[self._at[..., 1], self._at[..., 0]]
 
 
 def _borders(
