@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.alignment.averages import (
@@ -107,9 +107,7 @@ def test_average_transforms_is_left_equivariant(seed):
     T = np.stack([poses.exp(rng.normal(0, 0.01, 6)) for _ in range(5)])
     A = poses.exp(rng.normal(0, 1, 6))
     c = rng.normal(0, 1, 3)
-    there, here = average_transforms(A @ T, c), average_transforms(T, c)
-    assume(np.array_equal(there.kept, here.kept))  # rounding decides at the limit
-    np.testing.assert_allclose(there.T, A @ here.T, atol=1e-9)
+    np.testing.assert_allclose(average_transforms(A @ T, c).T, A @ average_transforms(T, c).T, atol=1e-9)
 
 
 @pytest.mark.parametrize(

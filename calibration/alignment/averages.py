@@ -96,10 +96,13 @@ def median_rotation(rotations: ArrayLike) -> Float64:
 
 
 def median_point(points: ArrayLike) -> Float64:
-    """Find the geometric median (3,) of points (N, 3), by Weiszfeld's algorithm from the component-wise median."""
+    """Find the geometric median (3,) of points (N, 3), by Weiszfeld's algorithm, started at the mean.
+
+    From there its steps are the same in every frame: near one of the points it creeps, and where it began would still be seen.
+    """
     P = np.asarray(points, dtype=np.float64)
     return _weiszfeld(
-        np.median(P, axis=0), lambda centre: P - centre, lambda centre, step: np.asarray(centre + step)
+        P.mean(axis=0), lambda centre: P - centre, lambda centre, step: np.asarray(centre + step)
     )
 
 
