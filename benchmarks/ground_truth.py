@@ -258,7 +258,7 @@ def planned(name: str, seed: int, views: int, folder: Path) -> None:
     plan = plan_views(model, rig, workcell, workcell.target, object_sampling(), views, rng)
     world.place(name)
 
-    def taken(place: PlannedView) -> tuple[View, dict[str, float]]:
+    def shot(place: PlannedView) -> tuple[View, dict[str, float]]:
         world.set_pose(place.T_base_flange, bytes([place.index]))
         now = iter(range(1, 10**12, 10**6)).__next__
         state = ArmState(place.joints, place.T_base_flange, 1)
@@ -268,9 +268,9 @@ def planned(name: str, seed: int, views: int, folder: Path) -> None:
         return view, numbers
 
     for view in plan.views:
-        best, numbers, spare = *taken(view), view.spare
+        best, numbers, spare = *shot(view), view.spare
         while spare is not None and any(limit.action == ELSEWHERE for limit in broken_limits(numbers)):
-            other, others = taken(spare)
+            other, others = shot(spare)
             if others.get("object_coverage", 0.0) > numbers["object_coverage"]:
                 best, numbers = other, others
             spare = spare.spare

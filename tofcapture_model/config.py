@@ -47,9 +47,7 @@ class Network:
     levels: int = 5  #: of every U-Net
     inputs: tuple[str, ...] = ("raw", "confidence", "depth")  #: of the paper's networks (table IV)
     windows: tuple[int, ...] = (2, 4)  #: radii, px, of the side-window plane fits that compact reads
-    leak: float = (
-        0.0  #: share of what is negative that a unit of compact's U-Net lets through; with none units die
-    )
+    leak: float = 0.0  #: share of what is negative that compact's U-Net lets through; with none, units die
     max_residual: float = 0.0  #: m that a depth may move beyond its candidates; 0: any distance
     learned_upsampling: bool = True  #: of depth, convex x2; false: bilinear
     refine_iterations: int = 2  #: rounds of depth to normals to depth

@@ -212,7 +212,8 @@ class Learner:
 def _pace(model: Model, parameter: Tensor) -> float:
     """Tell by how much slower a weight learns: Adam moves all by as much, and the sum of many should not move by more.
 
-    As Yang and Hu (2021) derive it, by the inverse of how many inputs are summed. The published networks have one rate, as published.
+    By the inverse of how many inputs are summed, after Yang and Hu (2021); a transposed convolution is taken by its outputs. The published networks
+    have one rate, as published.
     """
     if not isinstance(model, CompactModel) or parameter.ndim < _CONVOLUTION:
         return 1.0
